@@ -44,7 +44,7 @@ _AROUND_ROWS = 7
 """Of the table: the system, the columns' names and the lines around them, the verdict, and one row
 for the cursor."""
 
-_PHASES = ("connecting", "verifying", "activating", "active")
+_PHASES = ("connecting", "verifying", "activating", "measuring", "active")
 _OUTCOMES = {Outcome.OK: "green", Outcome.VIOLATED: "red", Outcome.UNVERIFIABLE: "yellow"}
 _STATES = {"active": "bold green", "inactive": "cyan", "finalized": "dim", "": "dim"}
 _PROCESS = {"running": "green", "starting": "yellow", "stopping": "yellow", "exited": "dim"}

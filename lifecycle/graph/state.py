@@ -175,7 +175,8 @@ class GraphState:
         with self._lock:
             if self._given.get(name) != configuration:
                 self._given = {**self._given, name: configuration}
-            self._set(name, configuration=configuration)
+            # What is counted changes all the time, and is no change of the graph.
+            self._set(name, configuration=replace(configuration, measured=None))
 
     def drop_configuration(self, node: str) -> None:
         """Forget a node (fully qualified) whose configuration was given: it is not there now."""

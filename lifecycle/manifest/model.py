@@ -541,11 +541,15 @@ class Quantity(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         name: the manifest's key, which has the unit: `max_delay_ms`, `rate_hz`, `five_qi`.
+        most: upper bound of a rate that has both; None without.
+        quantile: of a delay.
     """
 
     name: str
     value: float
     at: Position
+    most: float | None = None
+    quantile: float = 0.99
 
     def __str__(self) -> str:
         """Return `max_delay_ms 5`."""

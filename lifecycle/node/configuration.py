@@ -34,6 +34,7 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
@@ -120,14 +121,15 @@ _DIGITS = 16
 def checksum(configuration: NodeConfiguration) -> str:
     """Return 16 hex digits that change exactly when a reader must read the document again.
 
-    State, matches and what follows from them (whether a connection is established) change
-    all the time and are reported by events, so they do not count.
+    State, matches, what follows from them (whether a connection is established) and what is
+    measured change all the time and are reported by events, so they do not count.
     """
     stable = replace(
         configuration,
         state="",
         connected=False,
         checksum="",
+        measured=None,
         endpoints=tuple(
             replace(each, matched=None, server_matched=None) for each in configuration.endpoints
         ),
@@ -174,6 +176,7 @@ def collect(
     endpoints: Iterable[Endpoint],
     connections: Connections,
     health: HealthReport | None = None,
+    measured: Measured | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
@@ -184,6 +187,7 @@ def collect(
         endpoints: all that it has, declared ones that do not exist among them.
         connections: that it has.
         health: what it says of itself; None if it says nothing.
+        measured: what its subscriptions have counted; None while it is not active.
     """
     reports = endpoint_reports(node, endpoints)
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
@@ -205,6 +209,7 @@ def collect(
         connections=connection_reports(spec, connections, reports),
         parameters=parameters.reports(node),
         health=health,
+        measured=measured,
     )
     return replace(configuration, checksum=checksum(configuration))
 

@@ -398,6 +398,19 @@ class Plan(SystemDeclaration, frozen=True, kw_only=True):
                 return node
         raise KeyError(key)
 
+    @property
+    def bounds(self) -> tuple[Quantity, ...]:
+        """Every number that the manifest declares of data that flow."""
+        return (
+            *(
+                number
+                for node in self.nodes
+                for each in node.endpoints
+                for number in each.quantities
+            ),
+            *(number for flow in self.flows for number in flow.quantities),
+        )
+
 
 def uses_sim_time(node: PlannedNode) -> bool:
     """Return whether a node is given `use_sim_time: true`, by whatever way."""

@@ -21,6 +21,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
+from lifecycle.verify.rules.measured import measurements
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
@@ -193,7 +194,23 @@ def verify(
             if view.planned[each.node].endpoint_policy is EndpointPolicy.OPEN
         ),
         tolerated=_tolerated(view),
+        measured=measurements(view),
     )
+
+
+def without_measured(verdict: Verdict, policy: Policy) -> Verdict:
+    """Return `verdict` as it is while nodes pass a gate: what has arrived does not close it."""
+    kept = tuple(each for each in verdict.findings if not rule(each.rule).measured)
+    return replace(with_only(verdict, kept, policy), measured=())
+
+
+def apart_from_numbers(verdict: Verdict) -> Verdict:
+    """Return `verdict` without what is another number each time it is measured."""
+    findings = tuple(
+        replace(each, observed="", message="") if rule(each.rule).measured else each
+        for each in verdict.findings
+    )
+    return replace(verdict, findings=findings, measured=())
 
 
 def with_only(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -> Verdict:

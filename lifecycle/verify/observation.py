@@ -17,6 +17,7 @@ from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.measure.sample import Measured
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.parameters import portable
 from lifecycle.verify.outcome import ConnectionReport
@@ -158,11 +159,13 @@ class NodeConfiguration(msgspec.Struct, frozen=True, kw_only=True):
         serializations: wire formats, "cdr".
         paradigms: "publish-subscribe", "request-response".
         connections: every connection that exists or was asked for.
-        checksum: of everything but state, matches, whether connections are established, and itself;
-            changes exactly when a reader must read again. Hex SHA-256, 16 digits.
+        checksum: of everything but state, matches, whether connections are established, what was
+            measured, and itself; changes exactly when a reader must read again. Hex SHA-256, 16
+            digits.
         parameters: all that are declared, sorted by name; None where the node does not report them.
         health: what its health check last returned; None of a node that is not connected, or has
             none.
+        measured: what has arrived since it was activated; None while it is not active.
     """
 
     identity: Identity
@@ -178,6 +181,7 @@ class NodeConfiguration(msgspec.Struct, frozen=True, kw_only=True):
     connections: tuple[ConnectionReport, ...] = ()
     parameters: tuple[ParameterReport, ...] | None = None
     health: HealthReport | None = None
+    measured: Measured | None = None
 
 
 class ConfigurationError(ValueError):

@@ -74,6 +74,9 @@ def render_text(
     if verdict.tolerated:
         named = ", ".join(each.describe() for each in verdict.tolerated)
         lines += ["", *_wrap(named, max(width, 40), first="tolerated: ")]
+    measured = [each for each in verdict.measured if each.bounds]
+    if measured:
+        lines += ["", "measured", *(one_line(f"  {each.describe()}") for each in measured)]
     if flows and verdict.flows:
         lines += ["", "flows", *_flows(verdict.flows, colour=colour)]
     if verdict.run is not None:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from lifecycle.codec import DscpValue, Octet, says
+from lifecycle.codec import Count, DscpValue, Octet, says
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
@@ -114,6 +114,60 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
         msgspec.structs.force_setattr(self, "tuples", flow_tuples(self.source, self.destination))
 
 
+class MeasuredBound(msgspec.Struct, frozen=True, kw_only=True):
+    """A number that the manifest declares of a flow, and what was measured of it.
+
+    Attributes:
+        name: the manifest's key, `max_delay_ms`.
+        outcome: "measuring" while what has arrived cannot decide it.
+        text: `delay p99 0.6 ms ≤ 5 ms`.
+        decides_in_s: about how long it takes yet to decide; None if it is decided, or where that is
+            not known.
+    """
+
+    name: str
+    outcome: Annotated[str, says(enum=["measuring", "ok", "violated"])]
+    text: str
+    decides_in_s: float | None = None
+
+
+class FlowMeasurement(msgspec.Struct, frozen=True, kw_only=True):
+    """What has arrived of one publisher → subscription pair, at the subscription.
+
+    Attributes:
+        publisher: fully qualified node name.
+        subscription: fully qualified node name.
+        messages: how many arrived in the last 5 s or a little more.
+        lost: how many of those published meanwhile did not, by publication sequence numbers; None
+            where they do not show it.
+        rate_hz: messages per second of that time.
+        p50_ms: delay from publication to the start of the callback, milliseconds, of the last 200
+            messages or 5 s; None without a message, or between hosts.
+        p99_ms: likewise.
+        bounds: what the manifest declares of it.
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    messages: Count
+    lost: Count | None
+    rate_hz: float
+    p50_ms: float | None = None
+    p99_ms: float | None = None
+    bounds: tuple[MeasuredBound, ...] = ()
+
+    def describe(self) -> str:
+        """Return it in one line: `/video /camera → /viewer: delay p99 0.6 ms ≤ 5 ms, 15.0 Hz`."""
+        said = [each.text for each in self.bounds]
+        names = {each.name for each in self.bounds}
+        if "rate_hz" not in names:
+            said.append(f"{self.rate_hz:.1f} Hz")
+        if names.isdisjoint(("loss", "five_qi")) and self.lost is not None:
+            said.append(f"{self.lost} of {self.messages + self.lost} lost")
+        return f"{self.topic} {self.publisher} → {self.subscription}: {', '.join(said)}"
+
+
 class OpenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint that no manifest declares, of a node that may have such: `endpoints: open`.
 
@@ -190,6 +244,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
             this project are not listed while they do nothing but observe.
         judged: a system was looked at and every rule applied. If not, a rule without a finding
             says nothing, and the findings are what kept it from being judged.
+        measured: what has arrived of each flow that is counted, of an active system.
         run: how the run ended that this is the last verdict of; None of a system that is running.
     """
 
@@ -201,6 +256,15 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     tolerated: tuple[ToleratedNode, ...] = ()
     judged: bool = True
     run: RunEnd | None = None
+    measured: tuple[FlowMeasurement, ...] = ()
+
+    def is_measuring(self, within_s: float) -> bool:
+        """Return whether a declared number will be decided within so many seconds."""
+        return any(
+            bound.decides_in_s is not None and bound.decides_in_s <= within_s
+            for flow in self.measured
+            for bound in flow.bounds
+        )
 
 
 NOT_JUDGED = Verdict(

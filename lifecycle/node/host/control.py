@@ -30,6 +30,7 @@ import msgspec
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import DiscoveryRange
+from lifecycle.measure.sample import Measured
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -64,6 +65,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
         joins: the rest of its system runs already, and is asked to announce itself at once.
+        measures: the plan has numbers to compare with what is counted.
     """
 
     system: str
@@ -74,6 +76,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
     folders: tuple[str, ...] = ()
     log: str = ""
     joins: bool = False
+    measures: bool = False
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True):
@@ -115,7 +118,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
             `error` says why, the process exits),
             "state" (a node's state changed), "reply", "beat" (the executor has returned from a
             callback that took too long), "configuration" (it changed: endpoints, connections,
-            mappings or matches).
+            mappings or matches), "measured" (every half second, of an active node).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
         state: lifecycle_msgs/State label after it; empty of a plain node.
@@ -124,6 +127,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
             DEACTIVATE, CLEANUP and SHUTDOWN).
         changed: of a reply to ACTIVATE: nothing was done, for the node is not as it was reported.
+        measured: for "measured".
     """
 
     kind: str
@@ -135,6 +139,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
     configuration: NodeConfiguration | None = None
     changed: bool = False
+    measured: Measured | None = None
 
 
 _AT_ONCE_BYTES = 1 << 16
@@ -146,7 +151,7 @@ _OURS = f"{Path(__file__).parents[1]}{os.sep}"
 _LAST_S = 1.0
 """For a supervisor to read what is still to be sent when a host ends."""
 
-_NEWEST = frozenset({"state", "configuration", "beat"})
+_NEWEST = frozenset({"state", "configuration", "beat", "measured"})
 """Events of which only the latest of a node is worth sending to who has not read the one before."""
 
 

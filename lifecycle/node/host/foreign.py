@@ -30,6 +30,7 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -45,7 +46,7 @@ from lifecycle.node.configuration import ConfigurationChanges, Found, HostedStat
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.node_interface import serve_interface
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
-from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
+from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -236,6 +237,8 @@ class ForeignNode:
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
             self._gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
+        elif kind is EndpointKind.SUBSCRIPTION:
+            self._gate.add(entity, CountedSubscription(entity))
         watch: Watch | None = None
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
@@ -383,7 +386,12 @@ class ForeignNode:
             self.reported,
             endpoints=endpoints,
             connections=self._connections,
+            measured=self._gate.measured(),
         )
+
+    def measured(self) -> Measured | None:
+        """Return what has arrived since it was let through; None while it is held. Any thread."""
+        return self._gate.measured()
 
     @property
     def data_layer(self) -> DataLayer:

@@ -27,6 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
+from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
@@ -210,6 +211,8 @@ class Host:
         self._channel.write(Event(kind="ready"))
         if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
+        if self._spec.measures:
+            threading.Thread(target=self._report_measured, name="measured", daemon=True).start()
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported
@@ -307,6 +310,14 @@ class Host:
                 if self._has_other_marks(node):
                     self._note_marks(node)
                     node.configuration_changes.touch()
+
+    def _report_measured(self) -> None:
+        """Report again and again what active nodes have counted, whatever their callbacks do."""
+        while not self._left.wait(SLOT_S):
+            for name, hosted in tuple(self._nodes.items()):
+                measured = hosted.measured()
+                if measured is not None:
+                    self._channel.write(Event(kind="measured", node=name, measured=measured))
 
     def _has_other_marks(self, node: Hosted) -> bool:
         before = self._marks.get(node.full_name)

@@ -10,8 +10,12 @@ from __future__ import annotations
 
 import collections
 import inspect
-from collections.abc import Callable, Coroutine
+import time
+from collections.abc import Callable, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
+
+from lifecycle.measure.counter import Counter
+from lifecycle.measure.sample import Measured, Sample
 
 if TYPE_CHECKING:
     from rclpy.publisher import Publisher
@@ -21,6 +25,10 @@ if TYPE_CHECKING:
 
 Later = Callable[[Callable[[], Coroutine[Any, Any, None] | None]], object]
 """Runs a function, sync or async, in the node's executor, soon; false if the node is not spun."""
+
+
+Info = Mapping[str, int]
+"""Of a message, rmw_message_info_t as rclpy gives it."""
 
 
 class Gated(Protocol):
@@ -40,6 +48,7 @@ class NodeGate:
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
         self._is_open = False
+        self._opened_ns = 0
 
     @property
     def is_open(self) -> bool:
@@ -63,9 +72,21 @@ class NodeGate:
         self._entities.pop(id(entity), None)
         self._workers.pop(id(entity), None)
 
+    def measured(self) -> Measured | None:
+        """Return what subscriptions have counted; None while it is closed. From any thread."""
+        if not self._is_open:
+            return None
+        now_ns = time.monotonic_ns()
+        entities = tuple(self._entities.values())
+        counts = (each.sample(now_ns) for each in entities if isinstance(each, CountedSubscription))
+        return Measured(
+            active_s=(now_ns - self._opened_ns) / 1e9,
+            samples=tuple(each for each in counts if each is not None),
+        )
+
     def open(self) -> None:
         """Open every entity; the node became active."""
-        self._is_open = True
+        self._is_open, self._opened_ns = True, time.monotonic_ns()
         for gated in tuple(self._entities.values()):
             gated.open()
 
@@ -102,7 +123,37 @@ class GatedPublisher:
             )
 
 
-class GatedSubscription:
+class CountedSubscription:
+    """Counts what arrives while open: `lifecycle.measure`. Closed it leaves messages alone.
+
+    rclpy decides by the callback's signature, once per message, whether to pass the message info. A
+    callback of ours takes it always, so that a swap between take and call changes nothing.
+    """
+
+    def __init__(self, subscription: Subscription) -> None:
+        self._subscription = subscription
+        self._topic = str(subscription.topic_name)
+        self._call = _taking_info(subscription.callback)
+        self._counter: Counter | None = None
+
+    def open(self) -> None:
+        """Count from now on."""
+        if self._counter is None:
+            self._counter = Counter(time.monotonic_ns(), time.time_ns())
+            self._subscription.callback = _counting(self._call, self._counter)
+
+    def close(self) -> None:
+        """Count no more."""
+        self._counter = None
+        self._subscription.callback = self._call
+
+    def sample(self, now_ns: int) -> tuple[str, Sample] | None:
+        """Return the topic and what was counted; None while closed."""
+        counter = self._counter
+        return None if counter is None else (self._topic, counter.sample(now_ns))
+
+
+class GatedSubscription(CountedSubscription):
     """Takes and drops messages while closed, so that old ones do not wait for activation.
 
     A TRANSIENT_LOCAL sample is state, not an event: its publisher, activated before us, sends it
@@ -110,43 +161,66 @@ class GatedSubscription:
     """
 
     def __init__(self, subscription: Subscription, later: Later) -> None:
-        self._subscription = subscription
-        self._callback: Callable[..., Any] = subscription.callback
+        super().__init__(subscription)
         self._later = later
         qos = subscription.qos_profile
         self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
-        self._kept: collections.deque[tuple[object, ...]] = collections.deque(
+        self._kept: collections.deque[tuple[object, Info]] = collections.deque(
             maxlen=qos.depth or None
         )
-        # The same number of arguments as the user's: rclpy decides by signature, once per message,
-        # whether to pass the message info, and a swap in between must not change the answer.
-        is_one = _takes_one(self._callback)
-        self._drop = self._take_message if is_one else self._take_message_with_info
 
     def open(self) -> None:
         """Give messages to the user's callback, those first that were kept."""
-        self._subscription.callback = self._callback
+        super().open()
         if self._kept:
             self._later(self._deliver)
 
     def close(self) -> None:
         """Drop messages."""
+        super().close()
         self._subscription.callback = self._drop
 
-    def _take_message(self, message: object) -> None:
-        if self._keeps:
-            self._kept.append((message,))
-
-    def _take_message_with_info(self, message: object, info: object) -> None:
+    def _drop(self, message: object, info: Info) -> None:
         if self._keeps:
             self._kept.append((message, info))
 
     async def _deliver(self) -> None:
         # Closed again before this ran: then what was kept stays kept.
-        while self._kept and self._subscription.callback == self._callback:
-            returned = self._callback(*self._kept.popleft())
+        while self._kept and self._counter is not None:
+            returned = self._call(*self._kept.popleft())
             if inspect.isawaitable(returned):
                 await returned
+
+
+def _taking_info(callback: Callable[..., Any]) -> Callable[[Any, Info], Any]:
+    """Return a callback that takes message and info, whatever the user's takes."""
+    if not _takes_one(callback):
+        return callback
+    if inspect.iscoroutinefunction(callback):
+
+        async def awaited(message: object, _: Info) -> None:
+            await callback(message)
+
+        return awaited
+    return lambda message, _: callback(message)
+
+
+def _counting(call: Callable[[Any, Info], Any], counter: Counter) -> Callable[[Any, Info], Any]:
+    """Return a callback that notes each message before the user's is called."""
+    arrived, now_ns, wall_ns = counter.arrived, time.monotonic_ns, time.time_ns
+    if inspect.iscoroutinefunction(call):
+
+        async def awaited(message: object, info: Info) -> None:
+            arrived(now_ns(), wall_ns(), info)
+            await call(message, info)
+
+        return awaited
+
+    def counted(message: object, info: Info) -> Any:
+        arrived(now_ns(), wall_ns(), info)
+        return call(message, info)
+
+    return counted
 
 
 class GatedTimer:

@@ -132,7 +132,8 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One system.
 
     Attributes:
-        phase: "connecting", "verifying", "activating", "active", "pausing", "paused", "held" (some
+        phase: "connecting", "verifying", "activating", "measuring" (active, and what is declared of
+            its data is not decided yet), "active", "pausing", "paused", "held" (some
             nodes wait at a gate that stayed or was closed), "restarting",
             "switching" (to another mode), "applying" (another manifest), "rolling back" (to the
             manifest before) or "stopping".

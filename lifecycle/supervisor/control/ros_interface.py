@@ -243,7 +243,7 @@ def _of_node(
         level, message = ERROR, node.died
     elif node.silent:
         level, message = STALE, f"silent: {node.silent}"
-    elif level == OK and status.phase != "active":
+    elif level == OK and status.phase not in ("measuring", "active"):
         level, message = WARN, f"{message}, the system is {status.phase}"
     values = [
         ("state", node.state),

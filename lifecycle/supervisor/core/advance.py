@@ -441,6 +441,7 @@ def phase_of(run: Run) -> str:
         (coming, "restarting" if up else "connecting"),
         (run.asked is not None, "verifying"),
         (run.paused, "paused"),
+        (_is_whole(run) and gate.is_measuring(run), "measuring"),
         (_is_whole(run), "active"),
     )
     return next((name for holds, name in found if holds), "held")

@@ -87,7 +87,7 @@ def settle_mode(run: Run) -> list[Event]:
     if run.paused:
         return [entered]
     if not more:
-        is_whole = phase_of(run) == "active"
+        is_whole = phase_of(run) in ("measuring", "active")
         return [entered, *([SystemReached(reached="active", elapsed_s=run.now_s)] * is_whole)]
     until_s = run.now_s + run.options.timeout_s
     run.passage = Passage(until_s=until_s, mode="" if switch.back else switch.before)

@@ -100,6 +100,8 @@ def _asked(run: Run, finding: Finding) -> tuple[Consequence, Finding, tuple[str,
     """Return what would still have an effect."""
     reaction = reaction_of(run.plan, finding)
     what = reaction.what
+    if what is Consequence.REPORT and run.options.strict and rule(finding.rule).measured:
+        what = Consequence.PAUSE  # a strict gate would not have opened, had it been known
     names = set(finding.nodes or (finding.subject,))
     own = [each for each in run.nodes.values() if each.name in names]
     concerned = any(each.full_name in names for each in run.plan.nodes)

@@ -405,7 +405,7 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
 
 
 def _is_kept(run: Run) -> bool:
-    return phase_of(run) in ("active", "paused", "pausing")
+    return phase_of(run) in ("measuring", "active", "paused", "pausing")
 
 
 def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:

@@ -14,10 +14,11 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
-from lifecycle.verify.judge import not_ok, with_findings, with_only
+from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.measured import PROBATION_S
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
 from lifecycle.verify.verdict import Finding, FindingKey, Verdict
@@ -147,9 +148,10 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
-    is_new, judged.verdict = verdict != judged.verdict, verdict
+    before, judged.verdict = judged.verdict, verdict
     see_violations(run)
-    return verdict if is_new else None
+    is_same = before is not None and apart_from_numbers(verdict) == apart_from_numbers(before)
+    return None if is_same else verdict
 
 
 def is_foreign_activation(node: Node) -> bool:
@@ -236,6 +238,26 @@ def _is_strangers(run: Run, finding: Finding) -> bool:
     plans = (run.plan, *(() if change is None else (change.before, change.plan)))
     known = {each.full_name for plan in plans for each in plan.nodes}
     return finding.rule == UNDECLARED_NODE.id and known.isdisjoint(finding.nodes)
+
+
+def has_probation(run: Run) -> bool:
+    """Return whether the manifest declares numbers of data that are to flow."""
+    return run.options.until is Level.ACTIVE and bool(run.plan.bounds)
+
+
+def is_measuring(run: Run) -> bool:
+    """Return whether a declared number of a system that is held is decided before long.
+
+    That is its probation: PROBATION_S from when it was brought up, at most.
+    """
+    if run.held_s is None or run.decided_s is not None or not has_probation(run):
+        return False
+    until_s = run.held_s + PROBATION_S
+    if run.is_past(until_s):
+        return False
+    verdict, judged = run.judged.verdict, run.judged
+    left_s = until_s - run.now_s
+    return verdict is None or judged.mark < run.probation or verdict.is_measuring(left_s)
 
 
 def passed(judged: Judged) -> str:

@@ -415,21 +415,38 @@ def _hold(run: Run) -> list[Event]:
     if run.held_s is None:
         if run.passage is None and not run.failures and run.furthest:
             run.held_s = run.now_s
+            if not gate.has_probation(run):
+                run.decided_s = run.held_s
+            else:
+                run.changed()  # a look that began before it was up measures nothing
+                run.probation = run.mark
         return []
+    said: list[Event] = []
+    if run.decided_s is None:
+        if gate.is_measuring(run):
+            return []
+        run.decided_s, said = run.now_s, _measured(run)
     hold_s = run.options.hold_s
-    over_s = NEVER_S if hold_s is None else run.held_s + hold_s
+    over_s = NEVER_S if hold_s is None else run.decided_s + hold_s
     if not run.is_past(over_s) or run.order is not None or run.failures:
-        return []
+        return said
     waits = not gate.is_latest(run) and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
     if failure.only_elsewhere(run) and not run.is_past(over_s + advance.NOTICE_S):
-        return []  # who runs these may be about to say that it ends, too
+        return said  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
         waits = not (gate.allows(run) and gate.is_latest(run))
     if waits and not run.is_past(over_s + advance.GLANCE_S):
-        return []
-    return failure.end_done(run)
+        return said
+    return [*said, *failure.end_done(run)]
+
+
+def _measured(run: Run) -> list[Event]:
+    """Say what was measured of each flow of which a number is declared."""
+    verdict = run.judged.verdict
+    flows = () if verdict is None else verdict.measured
+    return [Notice(message=f"measured: {each.describe()}") for each in flows if each.bounds]
 
 
 def _returned(run: Run) -> list[Event]:

@@ -481,6 +481,9 @@ class Run(msgspec.Struct, kw_only=True):
         undone: how the order under way is answered once what it did is undone.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
+        decided_s: since when what is declared of its data is decided, as far as it can be before
+            long; None before.
+        probation: the mark from which on looks measure.
         pauses: it is to be said that it is paused, once nothing is active.
         failures: that end the run, as soon as what is in a step has failed, too, or not.
         fails_s: then it ends all the same.
@@ -514,6 +517,8 @@ class Run(msgspec.Struct, kw_only=True):
     undone: tuple[ExitCode, str] | None = None
     furthest: str = ""
     held_s: float | None = None
+    decided_s: float | None = None
+    probation: int = 0
     paused: bool = False
     pauses: bool = False
     passage: Passage | None = None

@@ -19,7 +19,7 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
-from lifecycle.verify.judge import verify, with_findings, without_findings
+from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -119,6 +119,9 @@ class Judge:
             ahead=system.run.ahead,  # as of now: some are activated meanwhile
             over=system.over(),
         )
+        run = system.run
+        if run.held_s is None or run.passage is not None:
+            verdict = without_measured(verdict, expected.policy)
         verdict = self._without_passing_peers(verdict, stage)
         limits = unlimited(each.planned for each in system.run.processes.values())
         wiring = () if self._looker is None else self._looker.findings()

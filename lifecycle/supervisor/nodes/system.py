@@ -376,6 +376,10 @@ class System:
         node = self._by_name.get(event.node)
         if node is None:
             return
+        if event.kind == "measured":
+            if node.configuration is not None:  # the next look has it
+                node.configuration = replace(node.configuration, measured=event.measured)
+            return
         if event.configuration is not None:
             node.configuration = event.configuration
         if event.kind != "reply" and event.state:

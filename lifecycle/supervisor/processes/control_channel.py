@@ -28,7 +28,7 @@ _LONGEST_LINE = 1 << 24
 _CLOSE_S = 0.5
 """For a host to read what it was sent before."""
 
-_UNASKED = frozenset({"state", "configuration"})
+_UNASKED = frozenset({"state", "configuration", "measured"})
 """Events by which a host reports on a node without having been asked."""
 
 

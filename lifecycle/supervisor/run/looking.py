@@ -46,6 +46,7 @@ from lifecycle.verify.observation import NodeConfiguration, Observation, Observe
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.measured import PROBATION_S
 from lifecycle.verify.tool_filter import tolerating_pattern
 from lifecycle.verify.verdict import Stage, Verdict
 
@@ -260,6 +261,8 @@ async def _unanswering(
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
     """Whether another look may change the result: what is not measured stays so."""
+    if verdict.is_measuring(PROBATION_S):
+        return True
     heals = [rule(each.rule).heals is not Heals.NEVER for each in verdict.findings]
     if verdict.verdict is Outcome.UNVERIFIABLE and closes(verdict, strict=strict):
         return all(heals)

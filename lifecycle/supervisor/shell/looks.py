@@ -23,6 +23,7 @@ from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
+from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -57,6 +58,9 @@ asked again: after this long, then twice as long each time, ..."""
 
 ASK_AGAIN_AT_MOST_S = 0.5
 """... up to this."""
+
+MEASURED_S = 1.0
+"""What has arrived is compared with what is declared so often; in the probation twice as often."""
 
 REMOTE_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
@@ -148,6 +152,8 @@ class Looks:
                 self._latest, found, self._system.expected, now_s
             )
             awaited_s += [] if kept_s is None else [kept_s]
+            if run.plan.bounds and stage is Stage.ACTIVE:
+                again_s.append(MEASURED_S if run.decided_s is not None else SLOT_S)
         self._latest = verdict
         closes = gate.closes(found, strict=run.options.strict)
         if not closes and stage is Stage.CONNECTED and (left_s := judge.unsaid_s(found)) > 0:

@@ -80,6 +80,7 @@ class Processes:
                 folders=manifest_folders(node.planned for node in nodes),
                 log=process.log.shown,
                 joins=system.run.held_s is not None,
+                measures=bool(system.plan.bounds),
             )
             channel = ControlChannel(spec, system.on_host_event, hung)
         try:

@@ -11,6 +11,7 @@ from lifecycle.verify.rules import (
     flows,
     health,
     matching,
+    measured,
     nodes,
     parameters,
     qos,
@@ -42,6 +43,7 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (flows.RULES, flows.check),
     (flows.TRANSPORT_RULES, flows.check_transport),
     (flows.DSCP_RULES, flows.check_dscp),
+    (measured.RULES, measured.check),
 )
 
 RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *run.RULES)

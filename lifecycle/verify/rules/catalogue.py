@@ -54,6 +54,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
         awaits: for a rule whose findings say that something is not known (yet), the rule that is
             broken while what would show it is not there; None for others.
         names_expected: its subjects mean nothing without what was expected of them.
+        measured: it compares what is declared with what has arrived: it never closes a gate.
         names_log: its fix is in a log, and ends in the name of the file where that is known.
     """
 
@@ -70,6 +71,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     awaits: Rule | None = None
     names_expected: bool = False
     names_log: bool = False
+    measured: bool = False
 
     @property
     def family(self) -> str:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport, Quantity, UniqueHow
+from lifecycle.manifest.model import EndpointKind, FlowTransport, UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
 from lifecycle.network.nfe import (
@@ -62,20 +62,11 @@ BROKEN_ENDPOINT = Rule(
     " no interface",
     concerns_flow=True,
 )
-NOT_MEASURED = Rule(
-    id="flow.not-measured",
-    meaning="a number that the manifest declares of a flow has not been measured",
-    outcomes=(Outcome.UNVERIFIABLE,),
-    fix="nothing here measures it: measure it where the data are used, or leave it out of the"
-    " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`",
-    heals=Heals.NEVER,
-    names_expected=True,
-)
-RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
+RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every strict endpoint, then every link's demand, then name what is not measured."""
+    """Judge every strict endpoint, then every link's demand."""
     for actual in view.actual:
         yield from _broken(actual)
         if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
@@ -83,53 +74,12 @@ def check(view: View) -> Iterator[Finding]:
     for flow in view.flows:
         if flow.planned.unique is not UniqueHow.NOT:
             yield from _demanded(flow, view.uniqueness)
-    yield from _not_measured(view)
 
 
-def _not_measured(view: View) -> Iterator[Finding]:
-    """One finding per declared number: it reports that the number was not compared."""
-    for actual in view.actual:
-        planned, node = actual.planned, actual.node.full_name
-        if actual.observed is None and actual.report is None:
-            continue  # it is missing, and that is said
-        for each in planned.quantities:
-            where = f"the {planned.kind.noun} of {planned.resolved} in {node}"
-            yield _unmeasured(
-                each, where, subject=planned.resolved, node=node, endpoint=planned.kind
-            )
-    for flow in view.flows:
-        if not flow.planned.quantities or _is_missing(flow):
-            continue
-        for each in flow.planned.quantities:
-            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
-
-
-def _is_missing(flow: FlowView) -> bool:
+def is_missing(flow: FlowView) -> bool:
     """Return whether nothing is seen of one end: it is missing, and that is said."""
     ends = (*flow.publishers, *flow.subscriptions)
     return any(end.observed is None and end.report is None for end in ends)
-
-
-def _unmeasured(
-    quantity: Quantity,
-    where: str,
-    *,
-    subject: str,
-    node: str = "",
-    endpoint: EndpointKind | None = None,
-    ends: tuple[str, ...] = (),
-) -> Finding:
-    return NOT_MEASURED.finding(
-        subject=subject,
-        expected=str(quantity),
-        observed="not measured",
-        message=f"nothing measures {quantity} of {where}",
-        at=quantity.at,
-        node=node,
-        endpoint=endpoint,
-        ends=ends,
-    )
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
@@ -177,7 +127,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
 def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     if not flow.publishers or not flow.subscriptions:
         return  # the link is unmatched, and says so
-    if _is_missing(flow):
+    if is_missing(flow):
         return
     how = flow.planned.unique.value
     publisher = uniqueness.all_unique(flow.publishers)
@@ -251,7 +201,7 @@ _WORDS = {
 def check_transport(view: View) -> Iterator[Finding]:
     """Judge every flow that must be carried by something."""
     for flow in view.flows:
-        if flow.publishers and flow.subscriptions and not _is_missing(flow):
+        if flow.publishers and flow.subscriptions and not is_missing(flow):
             yield from _judge_transport(view, flow)
 
 

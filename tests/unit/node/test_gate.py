@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import types
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import pytest
 
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
+
+INFO = {"source_timestamp": 0, "received_timestamp": 0, "publication_sequence_number": 1}
 
 
 class FakePublisher:
@@ -26,6 +29,7 @@ class FakeSubscription:
         self, callback: Callable[..., object], *, durability: str = "VOLATILE", depth: int = 2
     ) -> None:
         self.callback = callback
+        self.topic_name = "/video"
         self.qos_profile = types.SimpleNamespace(
             durability=types.SimpleNamespace(name=durability), depth=depth
         )
@@ -84,9 +88,28 @@ def test_a_removed_entity_is_left_alone() -> None:
 def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> None:
     subscription = FakeSubscription(lambda message, info: None)
     GatedSubscription(subscription, at_once).close()
-    subscription.callback("message", "info")
+    subscription.callback("message", INFO)
     with pytest.raises(TypeError):
         subscription.callback("message")
+
+
+def test_what_arrives_while_open_is_counted_since_then() -> None:
+    received: list[object] = []
+    gate, subscription = NodeGate(), FakeSubscription(received.append)
+    gate.add(subscription, GatedSubscription(subscription, at_once))
+    assert gate.measured() is None
+    gate.open()
+    later_ns = time.time_ns() + 10**9
+    for number in (4, 7):
+        info = {"received_timestamp": later_ns, "publication_sequence_number": number}
+        subscription.callback(number, {**info, "source_timestamp": later_ns})
+    measured = gate.measured()
+    assert received == [4, 7]
+    assert measured is not None
+    assert measured.active_s >= 0
+    assert [topic for topic, _ in measured.samples] == ["/video"]
+    gate.close()
+    assert gate.measured() is None
 
 
 def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> None:
@@ -95,7 +118,7 @@ def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> 
     subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL")
     tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
     gate.add(subscription, GatedSubscription(subscription, tasks.append))
-    subscription.callback("map")
+    subscription.callback("map", INFO)
     gate.open()
     gate.close()
     at_once(tasks[0])

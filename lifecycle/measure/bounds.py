@@ -1,0 +1,183 @@
+"""Whether a declared number is kept, once a sample can decide that. Pure.
+
+Owns: how much each bound needs to be judged: a delay 200 messages or 5 s, a loss 10 / bound
+messages, a rate 2 s and 20 periods. Until then nothing is said of it, as a canary analysis says
+nothing before its first interval is over.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import msgspec
+
+from lifecycle.measure.delays import Delays
+from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, Sample
+
+RATE_SLACK = 0.05
+"""A plain `rate_hz` is a lower bound with this slack."""
+
+RATE_S = 2.0
+RATE_PERIODS = 20
+LOSS_EVENTS = 10
+"""A share is known once so many losses would have been seen at the bound."""
+
+REPORTED_S = 1.0
+"""The reports of two nodes are of moments that are less than this apart."""
+
+
+class Kind(enum.Enum):
+    """What is measured."""
+
+    DELAY = "delay"  # from publication to the start of the callback
+    NETWORK_DELAY = "network delay"  # from publication to reception by the RMW
+    RATE = "rate"
+    LOSS = "loss"
+    SILENCE = "silence"
+
+
+class Bound(msgspec.Struct, frozen=True, kw_only=True):
+    """A declared number.
+
+    Attributes:
+        kind: what it bounds.
+        least: lower bound, of a rate: hertz; None without.
+        most: upper bound, of a delay milliseconds, of a rate hertz, of a loss a share, of a silence
+            seconds; None without.
+        slack: share of `least` that may be missing.
+        quantile: of a delay.
+    """
+
+    kind: Kind
+    least: float | None = None
+    most: float | None = None
+    slack: float = 0.0
+    quantile: float = 0.99
+
+
+class Judgement(msgspec.Struct, frozen=True, kw_only=True):
+    """What a sample says of a bound.
+
+    Attributes:
+        kept: None while the sample cannot decide.
+        observed: `delay p99 0.6 ms`; empty while nothing is known.
+        allowed: `≤ 5 ms`.
+        decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
+            where that is not known.
+    """
+
+    kept: bool | None
+    observed: str
+    allowed: str
+    decides_in_s: float | None = None
+
+
+def judge(bound: Bound, sample: Sample, *, publishes_s: float | None = None) -> Judgement:
+    """Judge a bound by what a subscription has counted.
+
+    Args:
+        bound: what is declared.
+        sample: of the subscription.
+        publishes_s: for how long its publisher has been let publish, seconds; None if not known.
+    """
+    if bound.kind is Kind.DELAY:
+        return _delay(bound, sample.used)
+    if bound.kind is Kind.NETWORK_DELAY:
+        return _delay(bound, sample.received)
+    if bound.kind is Kind.RATE:
+        return _rate(bound, sample, publishes_s)
+    if bound.kind is Kind.LOSS:
+        return _loss(bound, sample)
+    return _silence(bound, sample, publishes_s)
+
+
+def _delay(bound: Bound, delays: Delays) -> Judgement:
+    assert bound.most is not None
+    found, kept = delays.quantile_ms(bound.quantile), None
+    if found is not None and (delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S):
+        kept = found <= bound.most
+    observed = (
+        "" if found is None else f"{bound.kind.value} {percentile(bound.quantile)} {ms(found)}"
+    )
+    return Judgement(
+        kept=kept,
+        observed=observed,
+        allowed=_limit("≤", ">", kept, ms(bound.most)),
+        decides_in_s=max(0.0, DELAY_S - delays.seconds) if kept is None else None,
+    )
+
+
+def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
+    slowest = bound.least if bound.least is not None else bound.most
+    assert slowest is not None
+    needed_s = max(RATE_S, RATE_PERIODS / slowest)
+    seen = sample.last(seconds=needed_s)
+    new = publishes_s is not None and publishes_s < seen.seconds + REPORTED_S
+    decided = seen.seconds >= needed_s and not new
+    least = 0.0 if bound.least is None else bound.least * (1 - bound.slack)
+    # Where a slot begins and ends makes a difference of one message.
+    low = seen.messages + 1 < least * seen.seconds
+    high = bound.most is not None and seen.messages - 1 > bound.most * seen.seconds
+    if bound.most is not None and (high or bound.least is None):
+        allowed = _limit("≤", ">", not high, f"{bound.most:g} Hz")
+    else:
+        slack = f" - {bound.slack:.0%}" if bound.slack else ""
+        allowed = _limit("≥", "<", not low, f"{bound.least:g} Hz{slack}")
+    left_s = max(needed_s - seen.seconds, REPORTED_S) + (needed_s if new else 0.0)
+    return Judgement(
+        kept=not (low or high) if decided else None,
+        observed=f"{seen.rate_hz:.1f} Hz" if seen.seconds else "",
+        allowed=allowed,
+        decides_in_s=None if decided else left_s,
+    )
+
+
+def _loss(bound: Bound, sample: Sample) -> Judgement:
+    assert bound.most is not None
+    needed = LOSS_EVENTS / bound.most
+    seen = sample.last(published=needed)
+    kept: bool | None = None
+    if seen.lost > bound.most * max(seen.published, needed):
+        kept = False  # whatever else arrives
+    elif seen.published >= needed:
+        kept = True
+    left = needed - seen.published
+    return Judgement(
+        kept=kept,
+        observed=lost(seen.lost, seen.published) if seen.published else "",
+        allowed=_limit("≤", ">", kept, f"{bound.most:.6g}"),
+        decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
+    )
+
+
+def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
+    assert bound.most is not None
+    silent_s = sample.silent_s
+    if publishes_s is not None:
+        silent_s = min(silent_s, max(0.0, publishes_s - REPORTED_S))
+    kept = False if silent_s > bound.most else (True if sample.messages else None)
+    return Judgement(
+        kept=kept,
+        observed=f"silent for {silent_s:.1f} s",
+        allowed=_limit("≤", ">", kept, f"{bound.most:g} s"),
+        decides_in_s=max(0.0, bound.most - silent_s) if kept is None else None,
+    )
+
+
+def _limit(keeps: str, breaks: str, kept: bool | None, text: str) -> str:
+    return f"{breaks if kept is False else keeps} {text}"
+
+
+def percentile(quantile: float) -> str:
+    """Return `p99` for 0.99, `p99.9` for 0.999."""
+    return f"p{round(quantile * 100, 6):g}"
+
+
+def ms(value: float) -> str:
+    """Return milliseconds as people read them, `0.61 ms`."""
+    return f"{value:.3g} ms" if value < 1000 else f"{value:.0f} ms"
+
+
+def lost(number: int, published: int) -> str:
+    """Return `0 of 74 lost`."""
+    return f"{number} of {published} lost"

@@ -1,0 +1,155 @@
+"""Counts what arrives at one subscription: constant memory, about a microsecond a message.
+
+Owns: what is noted as a message arrives, the slots in which it is counted later, in another thread,
+and for how long they are kept. What is noted costs the callback's thread as little as possible. The
+clock is the caller's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping
+
+from lifecycle.measure.delays import Delays, bucket_of
+from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Sample, Slot
+
+WARM_UP_S = 0.5
+"""What arrives so soon after activation is not counted: others are being activated meanwhile."""
+
+_EACH_LEVEL = 6
+"""Slots of one length; when there are more, the two oldest become one of the next length."""
+
+_LEVELS = 14
+"""The oldest slots are those of half a second times 2**13: more than an hour each."""
+
+_MOST_NOTED = 4096
+"""More messages than this are counted at once, in the callback's thread."""
+
+_UNNUMBERED = 1 << 63
+"""RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED is larger, no sequence number is."""
+
+_NS = 1e9
+
+_Noted = tuple[int, int, int, int, int]
+
+
+class Counter:
+    """Counts the messages of one subscription of one publisher.
+
+    Args:
+        now_ns: on a clock that only goes forward; counting begins WARM_UP_S later.
+        wall_ns: then, on the clock of the source timestamps; what was published before does not
+            count.
+    """
+
+    def __init__(self, now_ns: int, wall_ns: int) -> None:
+        self._lock = threading.Lock()
+        self._noted: deque[_Noted] = deque()
+        self._published_ns = wall_ns + int(WARM_UP_S * _NS)
+        self._last_number = 0
+        self._all: dict[int, int] = {}
+        self._since_ns = self._slot_ns = self._last_ns = now_ns + int(WARM_UP_S * _NS)
+        self._messages = 0
+        self._lost: int | None = 0
+        self._levels: list[deque[Slot]] = [deque() for _ in range(_LEVELS)]
+        self._delays: deque[tuple[dict[int, int], dict[int, int]]] = deque(
+            maxlen=round(DELAY_S / SLOT_S)
+        )
+        self._open()
+
+    def _open(self) -> None:
+        self._slot_messages = self._slot_lost = 0
+        self._used: dict[int, int] = {}
+        self._received: dict[int, int] = {}
+
+    def arrived(self, now_ns: int, wall_ns: int, info: Mapping[str, int]) -> None:
+        """Note a message, at the start of its callback, with its rmw_message_info_t."""
+        self._noted.append(
+            (
+                now_ns,
+                wall_ns,
+                info["source_timestamp"],
+                info["received_timestamp"],
+                info["publication_sequence_number"],
+            )
+        )
+        if len(self._noted) > _MOST_NOTED:
+            self.count()
+
+    def count(self) -> None:
+        """Count what was noted; from any thread."""
+        with self._lock:
+            while self._noted:
+                self._count(*self._noted.popleft())
+
+    def sample(self, now_ns: int) -> Sample:
+        """Count what was noted, and return what is known now; from any thread."""
+        self.count()
+        with self._lock:
+            self._close_slots(now_ns)
+            slots = tuple(each for level in self._levels for each in level)
+            used, received = self._recent()
+            whole = Delays.of((self._all,))
+            return Sample(
+                seconds=max(0.0, (now_ns - self._since_ns) / _NS),
+                silent_s=max(0.0, (now_ns - self._last_ns) / _NS),
+                messages=self._messages,
+                lost=self._lost,
+                slots=slots,
+                used=used,
+                received=received,
+                p50_ms=whole.quantile_ms(0.5),
+                p99_ms=whole.quantile_ms(0.99),
+            )
+
+    def _recent(self) -> tuple[Delays, Delays]:
+        chosen: list[tuple[dict[int, int], dict[int, int]]] = []
+        messages = 0
+        for each in reversed(self._delays):
+            chosen.append(each)
+            messages += sum(each[0].values())
+            if messages >= DELAY_MESSAGES:
+                break
+        seconds = len(chosen) * SLOT_S
+        return (
+            Delays.of((used for used, _ in chosen), seconds=seconds),
+            Delays.of((received for _, received in chosen), seconds=seconds),
+        )
+
+    def _count(
+        self, now_ns: int, wall_ns: int, source_ns: int, received_ns: int, number: int
+    ) -> None:
+        numbered = 0 < number < _UNNUMBERED
+        before, self._last_number = self._last_number, number
+        if source_ns < self._published_ns or now_ns < self._since_ns:
+            return
+        self._close_slots(now_ns)
+        self._last_ns = now_ns
+        self._messages += 1
+        self._slot_messages += 1
+        if not numbered:
+            self._lost = None
+        elif 0 < before < number and self._lost is not None:  # else its publisher is a new one
+            self._lost += number - before - 1
+            self._slot_lost += number - before - 1
+        bucket = bucket_of(wall_ns - source_ns)
+        self._used[bucket] = self._used.get(bucket, 0) + 1
+        self._all[bucket] = self._all.get(bucket, 0) + 1
+        if received_ns > 0:
+            bucket = bucket_of(received_ns - source_ns)
+            self._received[bucket] = self._received.get(bucket, 0) + 1
+
+    def _close_slots(self, now_ns: int) -> None:
+        while now_ns - self._slot_ns >= SLOT_S * _NS:
+            self._slot_ns += int(SLOT_S * _NS)
+            self._delays.append((self._used, self._received))
+            self._keep(Slot(seconds=SLOT_S, messages=self._slot_messages, lost=self._slot_lost))
+            self._open()
+
+    def _keep(self, slot: Slot) -> None:
+        for level in self._levels:
+            level.appendleft(slot)
+            if len(level) <= _EACH_LEVEL:
+                return
+            slot = Slot.of((level.pop(), level.pop()))

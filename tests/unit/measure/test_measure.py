@@ -1,0 +1,213 @@
+"""What a subscription counts, compared with exact computation, and when it decides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from lifecycle.measure.bounds import Bound, Judgement, Kind, judge
+from lifecycle.measure.counter import WARM_UP_S, Counter
+from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, bucket_of, least_ns
+from lifecycle.measure.sample import DELAY_S, SLOT_S, Sample
+
+NS = 10**9
+WALL = 1_700_000_000 * NS
+"""When counting begins, on the publisher's clock; 0 on ours."""
+
+
+def counted(arrivals: Iterable[tuple[float, float, int]], *, until_s: float) -> Sample:
+    """Count messages: seconds of arrival since counting began, delay in ms, sequence number."""
+    counter = Counter(0, WALL)
+    for at_s, delay_ms, number in arrivals:
+        now_ns = round((at_s + WARM_UP_S) * NS)
+        source_ns = WALL + now_ns - round(delay_ms * 1e6)
+        info = {
+            "source_timestamp": source_ns,
+            "received_timestamp": source_ns + round(delay_ms * 5e5),
+            "publication_sequence_number": number,
+        }
+        counter.arrived(now_ns, WALL + now_ns, info)
+    return counter.sample(round((until_s + WARM_UP_S) * NS))
+
+
+def steady(
+    hertz: float, seconds: float, *, delay_ms: float = 1.0, lost: frozenset[int] = frozenset()
+) -> list[tuple[float, float, int]]:
+    """Messages at a steady rate; those that are lost by their number."""
+    return [
+        ((number - 0.5) / hertz, delay_ms, number)
+        for number in range(1, round(hertz * seconds) + 1)
+        if number not in lost
+    ]
+
+
+@given(st.integers(0, LONGEST_NS))
+def test_a_bucket_holds_the_delay_within_the_known_error(delay_ns: int) -> None:
+    least = least_ns(bucket_of(delay_ns))
+    assert least <= delay_ns <= least * (1 + ERROR)
+    assert 0 <= bucket_of(delay_ns) <= LAST_BUCKET
+
+
+@given(st.lists(st.integers(0, 10**11), min_size=1), st.sampled_from([0.5, 0.9, 0.98, 0.99]))
+def test_a_quantile_is_the_exact_one_within_the_known_error(
+    delays: list[int], quantile: float
+) -> None:
+    counts: dict[int, int] = {}
+    for each in delays:
+        counts[bucket_of(each)] = counts.get(bucket_of(each), 0) + 1
+    rank = min(math.ceil(quantile * len(delays) - 1e-9), max(len(delays) - 1, 1))
+    exact_ms = sorted(delays)[max(rank, 1) - 1] / 1e6
+    found_ms = Delays.of((counts,)).quantile_ms(quantile)
+    assert found_ms is not None
+    assert found_ms <= exact_ms <= found_ms * (1 + ERROR) + 1e-12
+
+
+def test_no_message_has_no_quantile_and_what_came_too_early_counts_as_no_delay() -> None:
+    assert Delays().quantile_ms(0.99) is None
+    assert bucket_of(-5) == 0
+    assert bucket_of(LONGEST_NS * 4) == LAST_BUCKET
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 0.4), st.floats(0, 100), st.integers(1, 4)), min_size=1, max_size=200
+    )
+)
+def test_what_is_counted_is_what_arrived(steps: list[tuple[float, float, int]]) -> None:
+    at_s, number, arrivals = 0.0, 0, []
+    for gap_s, delay_ms, numbers in steps:
+        at_s, number = at_s + gap_s, number + numbers
+        arrivals.append((at_s + 0.2, min(delay_ms, at_s * 1e3), number))
+    end_s = at_s + 1.0
+    sample = counted(arrivals, until_s=end_s)
+    assert sample.messages == len(arrivals)
+    assert sample.lost == number - steps[0][2] - (len(arrivals) - 1)
+    assert sample.silent_s == pytest.approx(end_s - arrivals[-1][0], abs=1e-6)
+    assert sample.seconds == pytest.approx(end_s, abs=1e-6)
+    past = sample.last(seconds=1e9)
+    assert past.seconds == math.floor((end_s + 1e-9) / SLOT_S) * SLOT_S
+    assert past.messages == sum(each[0] < past.seconds for each in arrivals)
+    assert len(sample.slots) < 100
+
+
+def test_what_was_published_before_activation_or_arrives_just_after_it_does_not_count() -> None:
+    kept = [(0.1, 500.0, 1), (-0.2, 1.0, 2)]
+    sample = counted([*kept, (0.3, 1.0, 3)], until_s=1.0)
+    assert (sample.messages, sample.lost) == (1, 0)
+
+
+def test_a_publisher_that_is_started_again_has_lost_nothing() -> None:
+    sample = counted([(0.1, 1, 41), (0.2, 1, 42), (0.3, 1, 1), (0.4, 1, 3)], until_s=1.0)
+    assert (sample.messages, sample.lost) == (4, 1)
+
+
+def test_an_rmw_without_sequence_numbers_has_an_unknown_loss() -> None:
+    assert counted([(0.1, 1, 2**64 - 1)], until_s=1.0).lost is None
+
+
+def test_memory_is_bounded_however_long_it_counts() -> None:
+    sample = counted(steady(0.2, 100_000), until_s=100_000)
+    assert len(sample.slots) < 100
+    assert sample.messages == 20_000
+    past = sample.last(seconds=36_000)
+    assert 36_000 <= past.seconds < 45_000
+    assert past.rate_hz == pytest.approx(0.2, rel=0.001)
+
+
+def verdict(bound: Bound, sample: Sample, publishes_s: float | None = None) -> bool | None:
+    return judge(bound, sample, publishes_s=publishes_s).kept
+
+
+DELAY = Bound(kind=Kind.DELAY, most=5.0)
+
+
+def test_a_delay_is_judged_after_200_messages_or_5_s() -> None:
+    assert verdict(DELAY, counted(steady(100, 1.5), until_s=1.5)) is None
+    assert verdict(DELAY, counted(steady(100, 2), until_s=2)) is True
+    assert verdict(DELAY, counted(steady(2, 4.5), until_s=4.5)) is None
+    assert verdict(DELAY, counted(steady(2, 5), until_s=DELAY_S)) is True
+    assert verdict(DELAY, counted([], until_s=60)) is None
+    assert verdict(DELAY, counted(steady(100, 2.5, delay_ms=8), until_s=2.5)) is False
+
+
+def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
+    slow = [(at_s, 8.0 if number % 30 == 0 else 1.0, number) for at_s, _, number in steady(100, 2)]
+    assert verdict(DELAY, counted(slow, until_s=2)) is False
+    assert verdict(Bound(kind=Kind.DELAY, most=5.0, quantile=0.9), counted(slow, until_s=2)) is True
+    later = [(at_s + 2, delay, number + 200) for at_s, delay, number in steady(100, 2)]
+    assert verdict(DELAY, counted([*slow, *later], until_s=4)) is True
+    one = [(at_s, 90.0 if number == 7 else 1.0, number) for at_s, _, number in steady(15, 5)]
+    assert verdict(DELAY, counted(one, until_s=5)) is True  # one message is no quantile
+
+
+def test_reception_is_judged_for_the_network() -> None:
+    sample = counted(steady(100, 2.5, delay_ms=8), until_s=2.5)
+    assert verdict(Bound(kind=Kind.NETWORK_DELAY, most=5.0, quantile=0.98), sample) is True
+
+
+RATE = Bound(kind=Kind.RATE, least=15.0, slack=0.05)
+
+
+def test_a_rate_is_judged_after_2_s_and_20_periods() -> None:
+    assert verdict(RATE, counted(steady(15, 1.5), until_s=1.5)) is None
+    assert verdict(RATE, counted(steady(15, 2), until_s=2)) is True
+    assert verdict(RATE, counted(steady(13, 2), until_s=2)) is False
+    assert verdict(RATE, counted([], until_s=2)) is False
+    slow = Bound(kind=Kind.RATE, least=1.0, slack=0.05)
+    assert verdict(slow, counted(steady(1, 19), until_s=19)) is None
+    assert verdict(slow, counted(steady(1, 20), until_s=20)) is True
+
+
+def test_a_rate_may_have_an_upper_bound() -> None:
+    between = Bound(kind=Kind.RATE, least=10.0, most=20.0)
+    assert verdict(between, counted(steady(25, 2), until_s=2)) is False
+    assert verdict(between, counted(steady(15, 2), until_s=2)) is True
+    assert verdict(Bound(kind=Kind.RATE, most=20.0), counted([], until_s=2)) is True
+
+
+def test_a_publisher_that_was_activated_just_now_has_no_rate_yet_and_is_not_silent() -> None:
+    sample = counted(steady(15, 2), until_s=60)
+    assert verdict(RATE, sample) is False
+    assert verdict(RATE, sample, publishes_s=1.0) is None
+    silence = Bound(kind=Kind.SILENCE, most=2.0)
+    assert verdict(silence, sample) is False
+    assert verdict(silence, sample, publishes_s=1.0) is True
+    assert verdict(silence, counted([], until_s=1.0)) is None
+    assert verdict(silence, counted([], until_s=3.0)) is False
+
+
+LOSS = Bound(kind=Kind.LOSS, most=0.01)
+
+
+def test_a_loss_is_judged_after_ten_losses_or_as_many_messages_as_would_have_them() -> None:
+    assert verdict(LOSS, counted(steady(100, 9), until_s=9)) is None
+    assert verdict(LOSS, counted(steady(100, 10), until_s=10)) is True
+    many = frozenset(range(10, 300, 10))
+    assert verdict(LOSS, counted(steady(100, 3, lost=many), until_s=3)) is False
+    later = steady(100, 15, lost=many)
+    assert verdict(LOSS, counted(later, until_s=15)) is True
+
+
+@given(st.integers(0, 60))
+def test_a_loss_is_compared_with_the_exact_share(number: int) -> None:
+    dropped = frozenset(range(20, 20 + 15 * number, 15))
+    sample = counted(steady(100, 10, lost=dropped), until_s=10)
+    assert verdict(LOSS, sample) is (number <= 10)
+
+
+@pytest.mark.parametrize(
+    ("bound", "expected"),
+    [
+        (DELAY, Judgement(kept=True, observed="delay p99 0.999 ms", allowed="≤ 5 ms")),
+        (RATE, Judgement(kept=True, observed="15.0 Hz", allowed="≥ 15 Hz - 5%")),
+        (LOSS, Judgement(kept=None, observed="0 of 74 lost", allowed="≤ 0.01")),
+    ],
+)
+def test_a_judgement_has_numbers(bound: Bound, expected: Judgement) -> None:
+    found = judge(bound, counted(steady(15, 5)[1:], until_s=5))
+    assert replace(found, decides_in_s=None) == expected
