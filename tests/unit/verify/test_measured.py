@@ -163,9 +163,7 @@ def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
     sample = arrived(300, 10)
     seen = change_report(SUB, "/a", matched=2)(perfect(plan, Stage.ACTIVE))
     counted = Measured(active_s=10, samples=(("/a", sample),))
-    verdict = verify(
-        plan, change_configuration("/two", measured=counted)(seen), stage=Stage.ACTIVE
-    )
+    verdict = verify(plan, change_configuration("/two", measured=counted)(seen), stage=Stage.ACTIVE)
     named = [(each.subject, each.expected) for each in of_data(verdict)]
     assert named == [("/a", "loss 0.01"), ("/a: /one → /two", "rate_hz 15")]
     assert [each.name for each in verdict.measured[0].bounds] == ["rate_hz", "max_delay_ms"]

@@ -10,7 +10,6 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Health,
     Policy,
-    Quantity,
     Run,
     RunKind,
 )
@@ -31,7 +30,6 @@ from tests.builders import (
     IMAGE,
     at,
     endpoint,
-    link,
     need,
     nfe,
     node,
