@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.diagnostics import DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop, set_within
+from lifecycle.graph.measuring import TopicMeasurements
 from lifecycle.graph.model import GraphChange
 from lifecycle.graph.parameters import Names, ParameterReadings
 from lifecycle.graph.state import Answer, GraphState
@@ -116,6 +117,7 @@ class Observer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._parameters = ParameterReadings(clients, loop, self._wake)
         self._diagnostics = DiagnosticReadings(clients, self._wake)
+        self._measurements = TopicMeasurements(clients)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
         self._to_note = False
@@ -163,6 +165,7 @@ class Observer:
                 if node.health is not None and node.health.diagnostics
             }
         )
+        self._measurements.listen(plan)
         answers = await self._ask_all(plan, nodes, planned - given.keys())
         self._answered = {name: said for name, (_, said) in answers.items() if said is not None}
         said = {**self.state.given, **self._answered}
@@ -177,6 +180,7 @@ class Observer:
             answers,
             parameters=self._parameters.latest,
             health=self._diagnostics.reports(),
+            measured=self._measurements.measured(),
         )
 
     def drop_configuration(self, node: str) -> None:

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from lifecycle.graph.model import End, GraphChange, Link, NodeView, link, match_ends
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.measure.sample import Measured
 from lifecycle.verify.observation import (
     HealthReport,
     NodeConfiguration,
@@ -262,6 +263,7 @@ class GraphState:
         *,
         parameters: tuple[NodeParameters, ...] = (),
         health: Mapping[str, HealthReport] = {},
+        measured: Measured | None = None,
     ) -> Observation:
         """Return what `lifecycle.verify` judges: what was seen, and what is given of nodes now.
 
@@ -273,6 +275,7 @@ class GraphState:
             answers: of the nodes that were asked, by full name.
             parameters: of nodes that do not report them.
             health: what /diagnostics says of nodes, by full name.
+            measured: what subscriptions of this process have counted.
         """
         given, seen = self._given, tuple(nodes)
         asked = {name: configuration for name, (_, configuration) in answers.items()}
@@ -289,4 +292,5 @@ class GraphState:
             endpoints=endpoints,
             configurations=tuple(each for each in {**given, **asked}.values() if each is not None),
             parameters=parameters,
+            measured=measured,
         )

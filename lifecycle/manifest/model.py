@@ -565,6 +565,8 @@ class MeasuredKeys(msgspec.Struct, frozen=True, kw_only=True):
         loss: Highest share of messages lost that this flow bears.
         rate_hz: Messages per second, of which 5 % may be missing; or 'min' and 'max', exactly.
         max_silence_s: Longest time without a message, seconds.
+        measure: Whether a subscription of ours measures it where the node that subscribes does not
+            run in our host.
     """
 
     max_delay_ms: Milliseconds | None = None
@@ -572,6 +574,7 @@ class MeasuredKeys(msgspec.Struct, frozen=True, kw_only=True):
     loss: Annotated[float, Meta(gt=0, le=1)] | None = None
     rate_hz: Hertz | Rate | None = None
     max_silence_s: Seconds | None = None
+    measure: bool = False
 
 
 class Quantity(msgspec.Struct, frozen=True, kw_only=True):

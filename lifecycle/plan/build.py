@@ -105,7 +105,15 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
     named: dict[tuple[str, str, str], list[Link]] = {}
     for link in links:
         named.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
-    return tuple(_flow(pair, named.get(pair, ())) for pair in {**pairs, **named})
+    asked = {(node.key, each.resolved) for node in nodes for each in node.endpoints if each.measure}
+    foreign = {node.key for node in nodes if node.run.kind is not RunKind.PYTHON}
+    found = []
+    for pair in {**pairs, **named}:
+        topic, *ends = pair
+        on_it = named.get(pair, ())
+        measure = any(each.measure for each in on_it) or any((end, topic) in asked for end in ends)
+        found.append(replace(_flow(pair, on_it), measure=measure and ends[1] in foreign))
+    return tuple(found)
 
 
 def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
@@ -530,6 +538,7 @@ def _planned_endpoint(
         transport=need.need.transport,
         lossy=need.need.lossy,
         quantities=need.need.quantities,
+        measure=need.need.measure,
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
         dscp_reason=need.marking.reason,

@@ -149,6 +149,7 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
         lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
             the QoS and to the node's own hint, which this overrides.
         quantities: each of its numbers that only a measurement could prove, as it is written.
+        measure: a subscription of ours measures them where nothing else does.
         dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
         dscp_reason: source of a DSCP that is not written as such; empty if it is.
         five_qi_reason: why it is this 5QI, or none, where the manifest has `auto`; else empty.
@@ -168,6 +169,7 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
     transport: FlowTransport = FlowTransport.ANY
     lossy: bool | None = None
     quantities: tuple[Quantity, ...] = ()
+    measure: bool = False
     dscp: DscpValue | None = None
     enforce_dscp: bool = True
     dscp_reason: str = ""
@@ -333,6 +335,7 @@ class PlannedFlow(msgspec.Struct, frozen=True, kw_only=True):
             nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
+        measure: a subscription of ours measures it: the node that subscribes cannot.
     """
 
     topic: str
@@ -345,6 +348,7 @@ class PlannedFlow(msgspec.Struct, frozen=True, kw_only=True):
     medium: str = ""
     medium_reason: str = ""
     quantities: tuple[Quantity, ...] = ()
+    measure: bool = False
 
 
 class PlannedServer(msgspec.Struct, frozen=True, kw_only=True):

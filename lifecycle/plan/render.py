@@ -227,15 +227,18 @@ def _endpoint_facts(endpoint: PlannedEndpoint) -> str:
         text
         for value, text in (
             (endpoint.max_delay_ms, f"at most {endpoint.max_delay_ms or 0:g} ms"),
-            (endpoint.loss, f"loss at most {endpoint.loss or 0:g}"),
-            (endpoint.rate_hz, f"{endpoint.rate_hz or 0:g} Hz"),
             (endpoint.max_message_size, f"at most {endpoint.max_message_size} bytes"),
         )
         if value is not None
     ]
+    facts += [str(each) for each in endpoint.quantities if each.name in _SHOWN]
     if endpoint.participant:
         facts.append(f"in {endpoint.participant}")
     return "; ".join(facts)
+
+
+_SHOWN = ("rate_hz", "loss", "max_silence_s")
+"""Numbers that are shown as they are written."""
 
 
 def spell_qos(qos: QosProfile) -> str:
@@ -271,6 +274,9 @@ def _flows(plan: Plan, width: int) -> list[str]:
             needs.append(f"{flow.unique.value} unique")
         if flow.max_delay_ms is not None:
             needs.append(f"at most {flow.max_delay_ms:g} ms")
+        needs += [str(each) for each in flow.quantities if each.name in _SHOWN]
+        if flow.measure:
+            needs.append("measured by a subscription of ours")
         if flow.linked and not needs:
             needs.append("linked")
         ends = f"{names[flow.publisher]} → {names[flow.subscription]}"

@@ -327,9 +327,11 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         parameters: of nodes that do not report them in their configuration.
+        measured: what subscriptions of the observer have counted; None where it has none.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
     endpoints: tuple[ObservedEndpoint, ...] = ()
     configurations: tuple[NodeConfiguration, ...] = ()
     parameters: tuple[NodeParameters, ...] = ()
+    measured: Measured | None = None

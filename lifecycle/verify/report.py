@@ -319,7 +319,8 @@ def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
 
     There are `open_endpoints`, `tolerated` and `measured`, too, where there are any. The last
     verdict of a run has `run`: why it ended, how far it came, its exit code, and what its gate took
-    on trust, if anything. Where no system was judged it has `"judged": false`, and its findings are why.
+    on trust, if anything. Where no system was judged it has `"judged": false`, and its findings are
+    why.
 
     Args:
         verdict: what to write.

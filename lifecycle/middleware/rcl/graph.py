@@ -174,7 +174,7 @@ class GraphObserver:
     ) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
-        All but its own node, of which there is only what it publishes under `names`. The
+        All but its own node, of which there is only what has one of these `names`. The
         housekeeping of client libraries is left out. Services are known by their nodes, so those
         of no known node are looked for by name.
 
@@ -218,10 +218,14 @@ class GraphObserver:
         ourselves = self._name if self.owns_node and counts.get(self._name) == 1 else None
         services, are_all = self._services_by_node(counts, ourselves)
         if ourselves is not None:
-            # Others match what a supervisor offers under names that are looked for.
+            # Others match what a supervisor offers under names that are looked for, and measures.
             del counts[ourselves]
             own = shown.pop(ourselves, [])
-            shown[ourselves] = [each for each in own if names.looks_for(each.kind, each.name)]
+            shown[ourselves] = [
+                each
+                for each in own
+                if names.looks_for(each.kind, each.name) or names.has(each.kind, each.name)
+            ]
         ends = functools.cache(functools.partial(service_ends, self.node))
         sought = _declared_services(names) | (set() if are_all else services_in(topics))
         others = self._services_by_name(sought, services, ends)

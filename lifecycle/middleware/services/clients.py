@@ -24,7 +24,9 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
 from lifecycle.middleware.services.parameters import (
     TYPES,
     differs,
@@ -408,6 +410,20 @@ class NodeClients:
             1.0, lambda: callback(()), group, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
+    def on_messages(
+        self,
+        topic: str,
+        type_: str,
+        qos: QosProfile,
+        callback: Callable[[bytes, Mapping[str, int]], None],
+    ) -> None:
+        """Have `callback` called with each message of a topic, serialized, and its message info.
+
+        Raises:
+            MiddlewareError: the type is not installed here.
+        """
+        self._subscribe(import_interface(type_), topic, callback, to_rclpy(qos), raw=True)
+
     def forget(self, node: str) -> None:
         """Drop the clients and the subscription of a node that left the graph."""
         self._calls.forget(f"{node}/")
@@ -423,11 +439,17 @@ class NodeClients:
             self._unsubscribe(topic)
 
     def _subscribe(
-        self, type_: type[Any], topic: str, callback: Callable[[Any], None], qos: QoSProfile | int
+        self,
+        type_: type[Any],
+        topic: str,
+        callback: Callable[..., None],
+        qos: QoSProfile | int,
+        *,
+        raw: bool = False,
     ) -> None:
         if topic not in self._subscriptions:
             self._subscriptions[topic] = self._observer.node.create_subscription(
-                type_, topic, callback, qos, callback_group=self._calls.group
+                type_, topic, callback, qos, callback_group=self._calls.group, raw=raw
             )
 
     def _unsubscribe(self, topic: str) -> None:

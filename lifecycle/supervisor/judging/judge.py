@@ -209,7 +209,8 @@ def without(observation: Observation, dead: frozenset[str]) -> Observation:
         node.full_name for node in observation.nodes if node.full_name in dead and node.count > 1
     }
     gone = dead - alive
-    return Observation(
+    return replace(
+        observation,
         nodes=tuple(
             replace(node, count=node.count - 1) if node.full_name in alive else node
             for node in observation.nodes

@@ -70,8 +70,8 @@ NOT_MEASURED = Rule(
     id="flow.not-measured",
     meaning="a number that the manifest declares of a flow has not been measured",
     outcomes=(Outcome.UNVERIFIABLE,),
-    fix="have the subscribing node run in our host (`run: python`), or leave the number out of the"
-    " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`",
+    fix="have the subscribing node run in our host (`run: python`), write `measure: true`, or leave"
+    " the number out; `--strict` refuses it, and so does `policy.unverifiable: block`",
     heals=Heals.NEVER,
     names_expected=True,
 )
@@ -159,7 +159,7 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             yield "a callback does not show the size of a message"
         elif not kinds:
             yield "128 to 254 are an operator's own classes"
-        if not self.flow.nodes[1].is_ours:
+        if not self.flow.nodes[1].is_ours and not self.flow.planned.measure:
             yield f"{self.flow.subscription} does not run in our host"
         if kinds & _DELAYS and _differ(self.flow):
             yield "the clocks of the two hosts are not compared"
@@ -343,6 +343,8 @@ def _differ(flow: FlowView) -> bool:
 def _sample(view: View, flow: FlowView) -> Sample | None:
     """Return what a subscription has counted, where its node is one that is brought up here."""
     facts: NodeFacts = flow.nodes[1]
+    if flow.planned.measure and view.measured is not None:
+        return view.measured.of(flow.planned.topic)
     configuration = facts.configuration
     # Of a node of another supervisor, that one has what it counts.
     if configuration is None or not facts.is_ours or not brings_up(facts.node, view.machines):

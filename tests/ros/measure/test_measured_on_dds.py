@@ -149,8 +149,19 @@ def test_what_a_node_of_others_takes_is_unverifiable_and_strict_refuses_it(
         },
         "managed": False,
     }
-    manifest, _ = system(tmp_path, fresh_domain, sink=own)
+    manifest, fault = system(tmp_path, fresh_domain, sink=own)
     with up(manifest, "--strict", runtime=tmp_path) as run:
         assert run.finish() == ExitCode.UNVERIFIABLE
         named = {each["expected"] for each in run.verdict["findings"]}
         assert {"max_delay_ms 20 for 0.9", "rate_hz 80", "loss 0.05", "max_silence_s 1"} <= named
+
+    # A subscription of ours measures it where the manifest asks for that.
+    manifest, fault = system(tmp_path, fresh_domain, sink=own, bounds={**BOUNDS, "measure": True})
+    with up(manifest, "--stop-after", "0.5", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.OK, run.events[-5:]
+        assert set(bounds_of(run.verdict).values()) == {"ok"}
+        assert not [each for each in run.verdict["findings"] if each["rule"] == "flow.not-measured"]
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        fault.write_text("slow")
+        run.until_found("flow.rate", SUBJECT)

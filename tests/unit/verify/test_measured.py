@@ -186,3 +186,23 @@ def test_nothing_is_said_of_a_number_whose_endpoint_is_missing() -> None:
     seen = perfect(plan, Stage.ACTIVE)
     gone = replace(seen, endpoints=tuple(each for each in seen.endpoints if each.kind is not SUB))
     assert of_data(verify(plan, gone, stage=Stage.ACTIVE)) == []
+
+
+def test_a_subscription_of_ours_measures_where_the_manifest_asks_for_it() -> None:
+    plan = planned(
+        node("one", publisher("a")),
+        node("two", subscription("a"), run=FOREIGN),
+        links=[link("/a", "one", "two", quantities=(number("rate_hz", 15),), measure=True)],
+    )
+    seen = perfect(plan, Stage.ACTIVE)
+    slow = Measured(active_s=0, samples=(("/a", arrived(50, 10)),))
+    verdict = verify(plan, replace(seen, measured=slow), stage=Stage.ACTIVE)
+    assert [each.rule for each in of_data(verdict)] == ["flow.rate"]
+    assert of_data(verify(plan, seen, stage=Stage.CONNECTED)) == []
+    asks_of_an_end = planned(
+        node("one", publisher("a"), needs=[need(PUB, "a", measure=True)]),
+        node("two", subscription("a"), run=FOREIGN),
+        node("three", subscription("a")),
+    )
+    measured = {each.subscription: each.measure for each in asks_of_an_end.flows}
+    assert measured == {"two": True, "three": False}
