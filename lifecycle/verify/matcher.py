@@ -128,6 +128,7 @@ def lay_out(
         seen_of_tools=tuple(map(_not_declared, _topical(of_tools))),
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
+        clocks=None if observation.clocks is None else dict(observation.clocks),
     )
 
 

@@ -17,6 +17,7 @@ from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.parameters import portable
@@ -327,9 +328,12 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         parameters: of nodes that do not report them in their configuration.
+        clocks: of the hosts of other machines of the system, each after the machine's name; None
+            where nobody compares them, or delays are not judged yet.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
     endpoints: tuple[ObservedEndpoint, ...] = ()
     configurations: tuple[NodeConfiguration, ...] = ()
     parameters: tuple[NodeParameters, ...] = ()
+    clocks: tuple[tuple[str, ClockOffset], ...] | None = None

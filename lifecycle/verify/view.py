@@ -13,6 +13,7 @@ import msgspec
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.measure.clock import ClockOffset
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import (
@@ -197,6 +198,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         seen_of_tools: those of tools, which others may be matched with too.
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
+        clocks: of the hosts of other machines, by the machine's name, as far as they are known;
+            None where that is not the question yet.
     """
 
     plan: Plan
@@ -221,6 +224,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     seen_of_tools: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
+    clocks: Mapping[str, ClockOffset] | None
 
 
 def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:

@@ -14,9 +14,11 @@ import functools
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
-from lifecycle.measure.bounds import RATE_SLACK, Bound, Judgement, Kind, judge
+from lifecycle.measure.bounds import RATE_SLACK, Bound, Judgement, Kind, apart, judge, ms
+from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.five_qi import five_qi_of
+from lifecycle.plan.model import Plan
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
@@ -27,6 +29,8 @@ PROBATION_S = 10.0
 """What can be decided at all in a system that was brought up is waited for this long."""
 
 _FIVE_QI_QUANTILE = 0.98
+
+_DELAYS = frozenset({Kind.DELAY, Kind.NETWORK_DELAY})
 
 
 def _rule(id_: str, meaning: str, fix: str) -> Rule:
@@ -121,6 +125,14 @@ def _of_five_qi(value: int) -> tuple[Bound, ...]:
     )
 
 
+def compares_clocks(plan: Plan) -> bool:
+    """Return whether a plan bounds delays, and data pass between its machines."""
+    machines = {node.key: node.machine for node in plan.nodes}
+    return any(machines[each.publisher] != machines[each.subscription] for each in plan.flows) and (
+        any(bound.kind in _DELAYS for number in plan.bounds for bound in bounds_of(number))
+    )
+
+
 def check(view: View) -> Iterator[Finding]:
     """Judge every number that is declared of a flow, or name it as not measured."""
     for actual in view.actual:
@@ -154,7 +166,7 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
         if sample is None or not _is_active(view, flow):
             continue
         past = sample.last(seconds=DELAY_S)
-        clocks = not _differ(flow)
+        clock = _clock(view, flow, sample)
         found.append(
             FlowMeasurement(
                 topic=flow.planned.topic,
@@ -163,8 +175,9 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 messages=past.messages,
                 lost=None if sample.lost is None or _publishers(view, flow) > 1 else past.lost,
                 rate_hz=past.rate_hz,
-                p50_ms=sample.used.quantile_ms(0.5) if clocks else None,
-                p99_ms=sample.used.quantile_ms(0.99) if clocks else None,
+                p50_ms=_corrected(sample, 0.5, clock),
+                p99_ms=_corrected(sample, 0.99, clock),
+                clock=clock if clock != SAME_CLOCK else None,
                 bounds=tuple(
                     _bound(quantity, judgement)
                     for quantity, _, judgement in _judgements(view, flow, sample)
@@ -174,15 +187,27 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
     return tuple(found)
 
 
+def _corrected(sample: Sample, quantile: float, clock: ClockOffset | None) -> float | None:
+    """Return a quantile of delays as one clock shows them, milliseconds; None if not known."""
+    found = sample.used.quantile_ms(quantile)
+    return None if found is None or clock is None else max(0.0, found + clock.offset_ms)
+
+
 def _bound(quantity: Quantity, judgement: Judgement) -> MeasuredBound:
-    outcome = {None: "measuring", True: "ok", False: "violated"}[judgement.kept]
-    between = ", measuring " if judgement.observed and judgement.kept is None else " "
+    undecided = "unverifiable" if _is_given_up(judgement) else "measuring"
+    outcome = {None: undecided, True: "ok", False: "violated"}[judgement.kept]
+    between = f", {undecided} " if judgement.observed and judgement.kept is None else " "
     return MeasuredBound(
         name=quantity.name,
         outcome=outcome,
         text=f"{judgement.observed}{between}{judgement.allowed}".strip(),
         decides_in_s=judgement.decides_in_s,
     )
+
+
+def _is_given_up(judgement: Judgement) -> bool:
+    """Return whether a delay is not decided for the clocks of two hosts, and not before long."""
+    return judgement.needs_clocks and judgement.decides_in_s is None
 
 
 def _judged(view: View, flow: FlowView) -> Iterator[Finding]:
@@ -198,6 +223,16 @@ def _judged(view: View, flow: FlowView) -> Iterator[Finding]:
                 expected=str(quantity),
                 observed=judgement.observed,
                 message=f"{where}: {observed}",
+                at=quantity.at,
+                ends=flow.ends,
+            )
+        elif _is_given_up(judgement) and view.clocks is not None:
+            why = _too_uncertain(quantity, bound, judgement, flow, _clock(view, flow, sample))
+            yield NOT_MEASURED.finding(
+                subject=flow.subject,
+                expected=str(quantity),
+                observed=judgement.observed or "not measured",
+                message=f"{quantity} of {where} is not measured: {why}",
                 at=quantity.at,
                 ends=flow.ends,
             )
@@ -221,6 +256,7 @@ def _judgements(
     counts = publisher is not None and publisher.measured is not None
     near = brings_up(flow.nodes[0].node, view.machines)
     publishes_s = publisher.measured.active_s if counts and near else None  # type: ignore[union-attr]
+    clock = _clock(view, flow, sample)
     seen: set[Bound] = set()
     ends = (each for end in flow.publishers for each in end.planned.quantities)
     for quantity in (*flow.planned.quantities, *ends):
@@ -229,7 +265,7 @@ def _judgements(
         for bound in bounds_of(quantity):
             if bound not in seen and not (bound.kind is Kind.LOSS and sample.lost is None):
                 seen.add(bound)
-                yield quantity, bound, judge(bound, sample, publishes_s=publishes_s)
+                yield quantity, bound, judge(bound, sample, publishes_s=publishes_s, clock=clock)
 
 
 def _unmeasured_at(
@@ -263,15 +299,66 @@ def _why_not(view: View, flow: FlowView, quantity: Quantity) -> str:
         return "nothing measures it"
     if not subscriber.is_ours:
         return f"{flow.subscription} does not run in our host"
-    if kinds & {Kind.DELAY, Kind.NETWORK_DELAY} and _differ(flow):
+    if kinds & _DELAYS and not _has_clocks(view, flow):
         return "the clocks of the two hosts are not compared"
     several = _publishers(view, flow)
-    if several > 1 and kinds - {Kind.DELAY, Kind.NETWORK_DELAY}:
+    if several > 1 and kinds - _DELAYS:
         return f"nothing shows which of the {several} publishers of the topic a message is from"
     sample = _sample(view, flow)
     if Kind.LOSS in kinds and sample is not None and sample.lost is None:
         return "its RMW gives messages no publication sequence numbers"
     return ""
+
+
+def _too_uncertain(
+    quantity: Quantity,
+    bound: Bound,
+    judgement: Judgement,
+    flow: FlowView,
+    clock: ClockOffset | None,
+) -> str:
+    """Return why a delay is not decided, for what is known of the clocks of the two hosts."""
+    assert bound.most is not None
+    publisher, subscriber = (each.node.machine for each in flow.nodes)
+    clocks = f"the clocks of {publisher} and {subscriber}"
+    if clock is None:
+        return f"{clocks} are not compared yet, or one was set a moment ago"
+    if clock.uncertainty_ms > bound.most:
+        named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
+        return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
+    found = f"{judgement.observed} may be more than {ms(bound.most)}, or not"
+    return f"{found}: {clocks} differ by {apart(clock)}"
+
+
+def _publishing(view: View, flow: FlowView) -> Iterator[FlowView]:
+    """Yield the flows by which a subscription of the flow gets its messages."""
+    for each in view.flows:
+        if (each.planned.topic, each.subscription) == (flow.planned.topic, flow.subscription):
+            yield each
+
+
+def _clock(view: View, flow: FlowView, sample: Sample) -> ClockOffset | None:
+    """Return what is known of the clocks of all who publish to a subscription; None if one is not.
+
+    Nothing shows which of several publishers a message is from.
+    """
+    far = {each.nodes[0].node.machine for each in _publishing(view, flow) if _differ(each)}
+    if not far:
+        return SAME_CLOCK
+    clocks = view.clocks or {}
+    # Where no shift is, it was counted as of this host's clock: the plan was another then.
+    if sample.used.shift_ns is None or not far <= clocks.keys():
+        return None
+    near = [SAME_CLOCK] if not all(map(_differ, _publishing(view, flow))) else []
+    return ClockOffset.any_of((*near, *(clocks[each] for each in far)))
+
+
+def _has_clocks(view: View, flow: FlowView) -> bool:
+    """Return whether a supervisor on each host of a flow compares its clock with the other's."""
+    machines = {each.node.machine for each in flow.nodes}
+    return not _differ(flow) or (
+        view.machines is not None and len(machines) == len(flow.nodes) and "" not in machines
+    )
 
 
 def _differ(flow: FlowView) -> bool:
@@ -284,11 +371,7 @@ def _differ(flow: FlowView) -> bool:
 
 def _publishers(view: View, flow: FlowView) -> int:
     """Return how many publishers a subscription of the flow has, planned or matched."""
-    planned = sum(
-        len(each.publishers) or 1
-        for each in view.flows
-        if (each.planned.topic, each.subscription) == (flow.planned.topic, flow.subscription)
-    )
+    planned = sum(len(each.publishers) or 1 for each in _publishing(view, flow))
     matched = [each.report.matched or 0 for each in flow.subscriptions if each.report is not None]
     return max((planned, *matched))
 
