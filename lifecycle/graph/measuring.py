@@ -50,13 +50,16 @@ class TopicMeasurements:
                 is_its = end.kind is EndpointKind.SUBSCRIPTION and end.resolved == flow.topic
                 if is_its and end.qos is not None:
                     qos = replace(end.qos, durability=Durability.VOLATILE, depth=_DEPTH)
-                    self._subscribe(flow.topic, end.type, qos)
+                    machines = {
+                        plan.node(key).machine for key in (flow.publisher, flow.subscription)
+                    }
+                    self._subscribe(flow.topic, end.type, qos, is_apart=len(machines) > 1)
 
-    def _subscribe(self, topic: str, type_: str, qos: QosProfile) -> None:
+    def _subscribe(self, topic: str, type_: str, qos: QosProfile, *, is_apart: bool) -> None:
         def arrived(_: bytes, info: Mapping[str, int]) -> None:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             if topic not in self._counters:
-                self._counters[topic] = Counter(now_ns, wall_ns)
+                self._counters[topic] = Counter(now_ns, wall_ns, is_apart=is_apart)
             self._counters[topic].arrived(now_ns, wall_ns, info)
 
         try:

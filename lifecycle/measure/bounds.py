@@ -11,13 +11,18 @@ import enum
 
 import msgspec
 
-from lifecycle.measure.delays import Delays
+from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
+from lifecycle.measure.delays import ERROR, Delays
 from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, Sample
 
 RATE_S = 2.0
 RATE_PERIODS = 20
 LOSS_EVENTS = 10
 """A share is known once so many losses would have been seen at the bound."""
+
+CLOCKS_S = 8.0
+"""A delay that the clocks of two hosts do not let decide is waited for so long: within the
+probation of a system."""
 
 REPORTED_S = 1.0
 """The reports of two nodes are of moments that are less than this apart."""
@@ -61,26 +66,36 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
         allowed: `≤ 5 ms`.
         decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
             where that is not known.
+        needs_clocks: the sample is large enough to decide, but too little is known of the clocks of
+            the two hosts.
     """
 
     kept: bool | None
     observed: str
     allowed: str
     decides_in_s: float | None = None
+    needs_clocks: bool = False
 
 
-def judge(bound: Bound, sample: Sample, *, publishes_s: float | None = None) -> Judgement:
+def judge(
+    bound: Bound,
+    sample: Sample,
+    *,
+    publishes_s: float | None = None,
+    clock: ClockOffset | None = SAME_CLOCK,
+) -> Judgement:
     """Judge a bound by what a subscription has counted.
 
     Args:
         bound: what is declared.
         sample: of the subscription.
         publishes_s: for how long its publisher has been let publish, seconds; None if not known.
+        clock: of its publisher's host; None if not known.
     """
     if bound.kind is Kind.DELAY:
-        return _delay(bound, sample.used)
+        return _delay(bound, sample, sample.used, clock)
     if bound.kind is Kind.NETWORK_DELAY:
-        return _delay(bound, sample.received)
+        return _delay(bound, sample, sample.received, clock)
     if bound.kind is Kind.RATE:
         return _rate(bound, sample, publishes_s)
     if bound.kind is Kind.LOSS:
@@ -88,19 +103,35 @@ def judge(bound: Bound, sample: Sample, *, publishes_s: float | None = None) -> 
     return _silence(bound, sample, publishes_s)
 
 
-def _delay(bound: Bound, delays: Delays) -> Judgement:
+def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | None) -> Judgement:
     assert bound.most is not None
-    found, kept = delays.quantile_ms(bound.quantile), None
-    if found is not None and (delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S):
-        kept = found <= bound.most
-    observed = (
-        "" if found is None else f"{bound.kind.value} {percentile(bound.quantile)} {ms(found)}"
+    found, kept, observed = delays.quantile_ms(bound.quantile), None, ""
+    is_enough = found is not None and (
+        delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S
     )
+    if found is not None and clock is not None:
+        delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
+        observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
+        if clock.uncertainty_ns:
+            # The bucket from which it was read is as large as this at most.
+            unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
+            observed += f" ± {ms(unsure_ms)}"
+        if is_enough and delay_ms - unsure_ms > bound.most:
+            kept = False
+        elif is_enough and delay_ms + unsure_ms <= bound.most:
+            kept = True
+    needs_clocks = is_enough and kept is None
+    decides_in_s: float | None = None
+    if needs_clocks and sample.seconds < CLOCKS_S:
+        decides_in_s = CLOCKS_S - sample.seconds
+    elif not is_enough:
+        decides_in_s = max(0.0, DELAY_S - delays.seconds)
     return Judgement(
         kept=kept,
         observed=observed,
         allowed=_limit("≤", ">", kept, ms(bound.most)),
-        decides_in_s=max(0.0, DELAY_S - delays.seconds) if kept is None else None,
+        decides_in_s=decides_in_s,
+        needs_clocks=needs_clocks,
     )
 
 
@@ -178,3 +209,8 @@ def ms(value: float) -> str:
 def lost(number: int, published: int) -> str:
     """Return `0 of 74 lost`."""
     return f"{number} of {published} lost"
+
+
+def apart(clock: ClockOffset) -> str:
+    """Return how far two clocks are apart, `512 ms ± 3.1 ms`."""
+    return f"{ms(abs(clock.offset_ms))} ± {ms(clock.uncertainty_ms)}"

@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Mapping
 
-from lifecycle.measure.delays import Delays, bucket_of
+from lifecycle.measure.delays import LONGEST_NS, Delays, bucket_of, signed_bucket_of
 from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Sample, Slot
 
 WARM_UP_S = 0.5
@@ -29,6 +29,10 @@ _MOST_NOTED = 4096
 _UNNUMBERED = 1 << 63
 """RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED is larger, no sequence number is."""
 
+_BELOW_NS = 1 << 26
+"""Where delays of another clock fall below their shift by more, about 67 ms, they are counted anew:
+their buckets would be larger than a millisecond."""
+
 _NS = 1e9
 
 _Noted = tuple[int, int, int, int, int]
@@ -41,9 +45,14 @@ class Counter:
         now_ns: on a clock that only goes forward; counting begins WARM_UP_S later.
         wall_ns: then, on the clock of the source timestamps; what was published before does not
             count.
+        is_apart: the source timestamps are of another host's clock, or of several: delays are
+            counted by how much longer they are than a short one, their shift.
     """
 
-    def __init__(self, now_ns: int, wall_ns: int) -> None:
+    def __init__(self, now_ns: int, wall_ns: int, *, is_apart: bool = False) -> None:
+        self._is_apart = is_apart
+        self._shift_ns: int | None = None
+        self._bucket_of = signed_bucket_of if is_apart else bucket_of
         self._lock = threading.Lock()
         self._noted: deque[_Noted] = deque()
         self._published_ns = wall_ns + int(WARM_UP_S * _NS)
@@ -80,8 +89,12 @@ class Counter:
     def count(self) -> None:
         """Count what was noted; from any thread."""
         with self._lock:
-            while self._noted:
-                self._count(*self._noted.popleft())
+            noted = [self._noted.popleft() for _ in range(len(self._noted))]
+            if self._is_apart and self._shift_ns is None:
+                new = (each for each in noted if self._is_new(each[1], each[2], each[3], WARM_UP_S))
+                self._shift_ns = min((each[1] - each[2] for each in new), default=None)
+            for each in noted:
+                self._count(*each)
 
     def sample(self, now_ns: int) -> Sample:
         """Count what was noted, and return what is known now; from any thread."""
@@ -90,7 +103,7 @@ class Counter:
             self._close_slots(now_ns)
             slots = tuple(each for level in self._levels for each in level)
             used, received = self._recent()
-            whole = Delays.of((self._all,))
+            whole = Delays.of((self._all,), shift_ns=self._shift_ns)
             return Sample(
                 seconds=max(0.0, (now_ns - self._since_ns) / _NS),
                 silent_s=max(0.0, (now_ns - self._last_ns) / _NS),
@@ -113,16 +126,27 @@ class Counter:
                 break
         seconds = len(chosen) * SLOT_S
         return (
-            Delays.of((used for used, _ in chosen), seconds=seconds),
-            Delays.of((received for _, received in chosen), seconds=seconds),
+            Delays.of((each[0] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
+            Delays.of((each[1] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
         )
+
+    def _is_new(
+        self, wall_ns: int, source_ns: int, received_ns: int, earlier_s: float = 0.0
+    ) -> bool:
+        """Return whether a message was published after counting began, or so much earlier.
+
+        Of another host's clock that is not known: then when it was received.
+        """
+        if self._is_apart:
+            source_ns = received_ns if received_ns > 0 else wall_ns
+        return source_ns >= self._published_ns - earlier_s * _NS
 
     def _count(
         self, now_ns: int, wall_ns: int, source_ns: int, received_ns: int, number: int
     ) -> None:
         numbered = 0 < number < _UNNUMBERED
         before, self._last_number = self._last_number, number
-        if source_ns < self._published_ns or now_ns < self._since_ns:
+        if now_ns < self._since_ns or not self._is_new(wall_ns, source_ns, received_ns):
             return
         self._close_slots(now_ns)
         self._last_ns = now_ns
@@ -133,11 +157,18 @@ class Counter:
         elif 0 < before < number and self._lost is not None:  # else its publisher is a new one
             self._lost += number - before - 1
             self._slot_lost += number - before - 1
-        bucket = bucket_of(wall_ns - source_ns)
+        shift_ns = self._shift_ns or 0
+        delay_ns = wall_ns - source_ns - shift_ns
+        if self._is_apart and not -_BELOW_NS < delay_ns < LONGEST_NS:
+            self._shift_ns = shift_ns = shift_ns + delay_ns
+            delay_ns = 0
+            self._all, self._used, self._received = {}, {}, {}
+            self._delays.clear()
+        bucket = self._bucket_of(delay_ns)
         self._used[bucket] = self._used.get(bucket, 0) + 1
         self._all[bucket] = self._all.get(bucket, 0) + 1
         if received_ns > 0:
-            bucket = bucket_of(received_ns - source_ns)
+            bucket = self._bucket_of(received_ns - source_ns - shift_ns)
             self._received[bucket] = self._received.get(bucket, 0) + 1
 
     def _close_slots(self, now_ns: int) -> None:

@@ -26,6 +26,11 @@ ERROR = 1 / _PARTS
 _NS_PER_MS = 1e6
 
 
+def signed_bucket_of(delay_ns: int) -> int:
+    """Return the bucket of a difference of two delays, which may be negative."""
+    return bucket_of(delay_ns) if delay_ns >= 0 else -bucket_of(-delay_ns)
+
+
 def bucket_of(delay_ns: int) -> int:
     """Return the bucket of a delay; what seems to arrive before it was sent counts as 0 ns."""
     if delay_ns < _PARTS:
@@ -37,6 +42,8 @@ def bucket_of(delay_ns: int) -> int:
 
 def least_ns(bucket: int) -> int:
     """Return the shortest delay of a bucket."""
+    if bucket < 0:
+        return 1 - least_ns(1 - bucket)
     if bucket < 2 * _PARTS:
         return bucket
     shift = (bucket >> _PART_BITS) - 1
@@ -45,7 +52,7 @@ def least_ns(bucket: int) -> int:
 
 LAST_BUCKET = bucket_of(LONGEST_NS)
 
-Bucket = Annotated[int, msgspec.Meta(ge=0, le=LAST_BUCKET)]
+Bucket = Annotated[int, msgspec.Meta(ge=-LAST_BUCKET, le=LAST_BUCKET)]
 
 
 class Delays(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,19 +61,29 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         seconds: how long it took them all to arrive.
         buckets: those with delays in them, in order, and how many there are in each.
+        shift_ns: added to each of those of a publisher on another host: how far its clock is ahead
+            is not known where they are counted, and small delays have small buckets; None where
+            all are of one clock.
     """
 
     seconds: float = 0.0
     buckets: tuple[tuple[Bucket, Count], ...] = ()
+    shift_ns: int | None = None
 
     @classmethod
-    def of(cls, counts: Iterable[dict[int, int]], *, seconds: float = 0.0) -> Delays:
+    def of(
+        cls,
+        counts: Iterable[dict[int, int]],
+        *,
+        seconds: float = 0.0,
+        shift_ns: int | None = None,
+    ) -> Delays:
         """Add up histograms, each the number of delays by bucket."""
         total: dict[int, int] = {}
         for each in counts:
             for bucket, number in each.items():
                 total[bucket] = total.get(bucket, 0) + number
-        return cls(seconds=seconds, buckets=tuple(sorted(total.items())))
+        return cls(seconds=seconds, buckets=tuple(sorted(total.items())), shift_ns=shift_ns)
 
     @property
     def messages(self) -> int:
@@ -89,5 +106,5 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
         for bucket, number in self.buckets:
             rank -= number
             if rank <= 0:
-                return least_ns(bucket) / _NS_PER_MS
+                return (least_ns(bucket) + (self.shift_ns or 0)) / _NS_PER_MS
         raise AssertionError("the ranks of a histogram end with its messages")

@@ -21,7 +21,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
-from lifecycle.verify.rules.measured import measurements
+from lifecycle.verify.rules.measured import NOT_MEASURED, measurements
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
@@ -207,7 +207,9 @@ def without_measured(verdict: Verdict, policy: Policy) -> Verdict:
 def apart_from_numbers(verdict: Verdict) -> Verdict:
     """Return `verdict` without what is another number each time it is measured."""
     findings = tuple(
-        replace(each, observed="", message="") if rule(each.rule).measured else each
+        replace(each, observed="", message="")
+        if rule(each.rule).measured or each.rule == NOT_MEASURED.id
+        else each
         for each in verdict.findings
     )
     return replace(verdict, findings=findings, measured=())

@@ -129,6 +129,7 @@ def lay_out(
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
         measured=observation.measured,
+        clocks=None if observation.clocks is None else dict(observation.clocks),
     )
 
 

@@ -17,6 +17,7 @@ from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.parameters import portable
@@ -328,6 +329,8 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         parameters: of nodes that do not report them in their configuration.
         measured: what subscriptions of the observer have counted; None where it has none.
+        clocks: of the hosts of other machines of the system, each after the machine's name; None
+            where nobody compares them, or delays are not judged yet.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
@@ -335,3 +338,4 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
     configurations: tuple[NodeConfiguration, ...] = ()
     parameters: tuple[NodeParameters, ...] = ()
     measured: Measured | None = None
+    clocks: tuple[tuple[str, ClockOffset], ...] | None = None

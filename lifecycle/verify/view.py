@@ -13,6 +13,7 @@ import msgspec
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import UniqueRequirement
@@ -199,6 +200,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
         measured: what subscriptions of the observer have counted; None where it has none.
+        clocks: of the hosts of other machines, by the machine's name, as far as they are known;
+            None where that is not the question yet.
     """
 
     plan: Plan
@@ -224,6 +227,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
     measured: Measured | None
+    clocks: Mapping[str, ClockOffset] | None
 
 
 def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:

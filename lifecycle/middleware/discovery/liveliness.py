@@ -9,6 +9,10 @@ Fast DDS 2.14 does not repeat an assertion that was lost on the way, so it is as
 An AUTOMATIC writer would be asserted by Fast DDS's event thread, which stands still while a leaving
 peer's writer is removed.
 
+Beside which nodes are silent, a notice says when its sender received the last one of each other
+supervisor. So two of them exchange the four timestamps by which their clocks are compared
+(lifecycle.measure.clock): Fast DDS takes them where it sends and receives.
+
 `PlanNotices` is the topic on which supervisors of one domain publish their plans, to detect
 conflicts. Its name holds no system: a supervisor that was started with another manifest must be
 noticed too. The last notice of each is kept for late joiners. Its content is text here, see
@@ -18,12 +22,14 @@ lifecycle.plan.comparison.
 from __future__ import annotations
 
 import functools
-import json
 import logging
 import threading
+import time
 import typing
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
+import msgspec
 from rclpy.duration import Duration
 from rclpy.event_handler import (
     PublisherEventCallbacks,
@@ -36,7 +42,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty, String
 
-from lifecycle.codec import from_json
+from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.names import ALIVE_PULSE
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import latched
@@ -50,6 +56,17 @@ ASSERTED_EACH_S = 0.06
 
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
+
+_Ns = typing.Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+
+Received = Mapping[str, tuple[int, int]]
+"""When the last notice of each machine was sent, on its clock, and received, on ours; ns."""
+
+
+class _Notice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    silent: dict[str, str]
+    received: dict[str, tuple[_Ns, _Ns]] = {}
+
 
 _logger = logging.getLogger(__name__)
 
@@ -97,13 +114,16 @@ class AlivePublisher:
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
-    def notify(self, silent: Mapping[str, str]) -> None:
+    def notify(self, silent: Mapping[str, str], received: Received = MappingProxyType({})) -> None:
         """Publish which of our nodes are silent, and why each is; from any thread.
+
+        With `received`, as AliveSubscription has them, clocks are compared.
 
         Present and later subscribers receive it. A message may be lost for some seconds: publish
         it again.
         """
-        self._publisher.publish(String(data=json.dumps(dict(silent))))
+        notice = _Notice(silent=dict(silent), received=dict(received))
+        self._publisher.publish(String(data=to_json(notice).decode()))
 
     def destroy(self) -> None:
         """Leave properly, which peers see and do not count as a loss."""
@@ -144,7 +164,9 @@ class AliveSubscription:
         topic: of the publisher.
         on_liveliness: called with True when it is alive, False when its lease has expired.
         on_left: called when it left properly.
-        on_notice: called with what `AlivePublisher.notify` published.
+        on_notice: called with the silent nodes that `AlivePublisher.notify` published.
+        on_times: called before it with when that was sent, on its clock, and received, on ours, in
+            nanoseconds, and with what its sender has received.
     """
 
     def __init__(
@@ -155,6 +177,7 @@ class AliveSubscription:
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
         on_notice: Callable[[Mapping[str, str]], None],
+        on_times: Callable[[int, int, Received], None],
     ) -> None:
         def changed(info: QoSLivelinessChangedInfo) -> None:
             if info.alive_count > 0:
@@ -164,12 +187,16 @@ class AliveSubscription:
             else:
                 on_left()
 
-        def received(message: String) -> None:
+        def received(message: String, info: Mapping[str, int]) -> None:
             try:
-                on_notice(from_json(message.data, dict[str, str], longest=_LONGEST_NOTICE))
+                notice = from_json(message.data, _Notice, longest=_LONGEST_NOTICE)
             except ValueError as error:
                 # Any participant may write the topic, and no executor thread may end by it.
                 _logger.warning("cannot read what is silent: %s", error)
+                return
+            received_ns = info["received_timestamp"] or time.time_ns()
+            on_times(info["source_timestamp"], received_ns, notice.received)
+            on_notice(notice.silent)
 
         self._node = node
         self._subscriptions = (

@@ -66,6 +66,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
         log: file that it appends its output to once its supervisor was killed; empty for none.
         joins: the rest of its system runs already, and is asked to announce itself at once.
         measures: the plan has numbers to compare with what is counted.
+        apart: fully qualified topics whose publishers another supervisor has, on another clock.
     """
 
     system: str
@@ -77,6 +78,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
     log: str = ""
     joins: bool = False
     measures: bool = False
+    apart: tuple[str, ...] = ()
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True):

@@ -158,6 +158,7 @@ class ForeignNode:
     Attributes:
         node: rclpy's.
         spec: what it was planned to be.
+        gate: holds back what it publishes, and counts what arrives.
         configuration_changes: notifies of each change of its configuration.
     """
 
@@ -175,7 +176,7 @@ class ForeignNode:
         self._loop = loop
         self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
-        self._gate = NodeGate()
+        self.gate = NodeGate()
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
@@ -194,7 +195,7 @@ class ForeignNode:
         self._found = Found(spec.at, self.configuration_changes.touch)
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
-            self._gate.open()
+            self.gate.open()
         self._services = self._serve()
 
     def _serve(self) -> tuple[Any, ...]:
@@ -236,9 +237,9 @@ class ForeignNode:
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
-            self._gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
+            self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self._gate.add(entity, CountedSubscription(entity))
+            self.gate.add(entity, CountedSubscription(entity))
         watch: Watch | None = None
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
@@ -343,7 +344,7 @@ class ForeignNode:
 
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
-        self._gate.remove(entity)
+        self.gate.remove(entity)
         placement = self._found.remove(entity)
         if placement is None:
             return
@@ -386,12 +387,12 @@ class ForeignNode:
             self.reported,
             endpoints=endpoints,
             connections=self._connections,
-            measured=self._gate.measured(),
+            measured=self.gate.measured(),
         )
 
     def measured(self) -> Measured | None:
         """Return what has arrived since it was let through; None while it is held. Any thread."""
-        return self._gate.measured()
+        return self.gate.measured()
 
     @property
     def data_layer(self) -> DataLayer:
@@ -491,7 +492,7 @@ class ForeignNode:
         """Notify the listeners; what leaves the data layer behind is not what was verified."""
         if self._supervisor and self.reported.label in ("unconfigured", "finalized"):
             self._let_through = False
-            self._gate.close()
+            self.gate.close()
         for listener in self._listeners:
             listener(self)
 
@@ -501,13 +502,13 @@ class ForeignNode:
 
     def _release(self) -> None:
         self._let_through = True
-        self._gate.open()
+        self.gate.open()
         if self._machine is None:
             self._spin()
 
     def _hold(self) -> None:
         self._let_through = False
-        self._gate.close()
+        self.gate.close()
         if self._machine is None:
             self._is_spun = False
             self._loop.rest(self.node)

@@ -42,9 +42,14 @@ class Gated(Protocol):
 
 
 class NodeGate:
-    """All gated entities of one node; closed until the node is active."""
+    """All gated entities of one node; closed until the node is active.
+
+    Attributes:
+        apart: topics that are published by another host's clock.
+    """
 
     def __init__(self) -> None:
+        self.apart: frozenset[str] = frozenset()
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
         self._is_open = False
@@ -59,7 +64,7 @@ class NodeGate:
         """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
         if self._is_open:
-            gated.open()
+            self._open(gated)
         else:
             gated.close()
 
@@ -88,7 +93,12 @@ class NodeGate:
         """Open every entity; the node became active."""
         self._is_open, self._opened_ns = True, time.monotonic_ns()
         for gated in tuple(self._entities.values()):
-            gated.open()
+            self._open(gated)
+
+    def _open(self, gated: Gated) -> None:
+        if isinstance(gated, CountedSubscription):
+            gated.is_apart = gated.topic in self.apart
+        gated.open()
 
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
@@ -128,18 +138,24 @@ class CountedSubscription:
 
     rclpy decides by the callback's signature, once per message, whether to pass the message info. A
     callback of ours takes it always, so that a swap between take and call changes nothing.
+
+    Attributes:
+        topic: fully qualified.
+        is_apart: it is published by another host's clock.
     """
 
     def __init__(self, subscription: Subscription) -> None:
         self._subscription = subscription
-        self._topic = str(subscription.topic_name)
+        self.topic = str(subscription.topic_name)
+        self.is_apart = False
         self._call = _taking_info(subscription.callback)
         self._counter: Counter | None = None
 
     def open(self) -> None:
         """Count from now on."""
         if self._counter is None:
-            self._counter = Counter(time.monotonic_ns(), time.time_ns())
+            now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+            self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
             self._subscription.callback = _counting(self._call, self._counter)
 
     def close(self) -> None:
@@ -150,7 +166,7 @@ class CountedSubscription:
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None while closed."""
         counter = self._counter
-        return None if counter is None else (self._topic, counter.sample(now_ns))
+        return None if counter is None else (self.topic, counter.sample(now_ns))
 
 
 class GatedSubscription(CountedSubscription):

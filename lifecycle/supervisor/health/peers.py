@@ -1,9 +1,9 @@
 """The other supervisors of a system, and the nodes that it attaches to: alive, lost, left, agreed.
 
 Owns: `Peers`: announcing ourselves and our plan, noticing who is found, lost or shut down, what
-they report of silent nodes, and comparing plans. A manifest with another node, another argument or
-another flow need on one of the hosts passes every check of the running graph there: only the plans
-show it. Nothing here polls. Must not import rclpy.
+they report of silent nodes, comparing clocks and plans. A manifest with another node, another
+argument or another flow need on one of the hosts passes every check of the running graph there:
+only the plans show it. Nothing here polls. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import time
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from msgspec.structs import replace
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.comparison import (
@@ -37,6 +39,7 @@ from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.measured import compares_clocks
 from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
 from lifecycle.verify.verdict import Finding, Verdict
@@ -46,6 +49,7 @@ if TYPE_CHECKING:
         AlivePublisher,
         AliveSubscription,
         PlanNotices,
+        Received,
     )
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
     from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -56,6 +60,9 @@ endpoints, and where Fast DDS lost that, 3 s later."""
 
 SAID_AFTER_S = (0.0, 0.1, 0.4)
 """Which nodes are silent is published again: Fast DDS repeats what was lost after up to 3 s."""
+
+EXCHANGED_S = 1.0
+"""Clocks are compared so often, where a delay between machines is declared."""
 
 FAILED = "failed: "
 """How the reason of a supervisor begins whose run failed."""
@@ -103,6 +110,9 @@ class Peers:
         self._attached: dict[str, _Peer] = {}
         self._announcements: list[AlivePublisher] = []
         self._silent: Mapping[str, str] = {}
+        self._received: dict[str, tuple[int, int]] = {}
+        self._clocks: dict[str, ClockComparison] = {}
+        self._exchanging: asyncio.TimerHandle | None = None
         self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
         self._said: PlanNotice | None = None
@@ -154,6 +164,8 @@ class Peers:
             plan = self._system.first
             self._said = notice_of(plan, run=self._run, host=machine_id(), machines=self._own)
             self._notices.announce(encode(self._said))
+            if self._announcements and self._exchanging is None:
+                self._exchange()
 
     def leave(self, reason: str) -> None:
         """Say that what comes is an orderly end, and why; begins with FAILED where a run failed."""
@@ -163,8 +175,9 @@ class Peers:
 
     async def close(self) -> None:
         """Announce, watch and compare no more."""
-        if self._again is not None:
-            self._again.cancel()
+        for timer in (self._again, self._exchanging):
+            if timer is not None:
+                timer.cancel()
         if self._notices is not None:
             self._notices.destroy()
             self._notices = None
@@ -201,6 +214,7 @@ class Peers:
             on_liveliness=calls(self._alive),
             on_left=calls(self._left),
             on_notice=calls(self._reported),
+            on_times=calls(self._timed),
         )
         return peer
 
@@ -264,10 +278,36 @@ class Peers:
         def say() -> None:
             if silent is self._silent:
                 for each in self._announcements:
-                    each.notify(silent)
+                    each.notify(silent, self._received)
 
         for wait_s in SAID_AFTER_S:
             self._loop.call_later(wait_s, say)
+
+    # What time it is there
+
+    def _exchange(self) -> None:
+        """Have others compare their clocks with ours, again and again while that is needed."""
+        self._exchanging = None
+        if compares_clocks(self._system.first):
+            for each in self._announcements:
+                each.notify(self._silent, self._received)
+            self._exchanging = self._loop.call_later(EXCHANGED_S, self._exchange)
+
+    def _timed(self, peer: _Peer, sent_ns: int, received_ns: int, theirs: Received) -> None:
+        """It sent a notice, having received ours."""
+        if not peer.machine:
+            return
+        self._received[peer.machine] = (sent_ns, received_ns)
+        clock = self._clocks.setdefault(peer.machine, ClockComparison())
+        for machine in self._own:
+            if machine in theirs:
+                clock.add(*theirs[machine], sent_ns, received_ns)
+
+    def clocks(self) -> tuple[tuple[str, ClockOffset], ...]:
+        """Return how far the clocks of other machines are ahead, of those that are known."""
+        now_ns = time.time_ns()
+        found = ((machine, each.offset(now_ns)) for machine, each in self._clocks.items())
+        return tuple((machine, offset) for machine, offset in found if offset is not None)
 
     def _have_hosts(self, operation: Operation) -> None:
         """Have our hosts do something with all of their process; one that hangs holds up none."""

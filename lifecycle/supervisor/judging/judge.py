@@ -106,6 +106,10 @@ class Judge:
         system = self._system
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
+        run = system.run
+        is_measured = run.held_s is not None and run.passage is None
+        if is_measured:
+            observation = replace(observation, clocks=self._peers.clocks())
         self.seen = observation
         system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
@@ -119,8 +123,7 @@ class Judge:
             ahead=system.run.ahead,  # as of now: some are activated meanwhile
             over=system.over(),
         )
-        run = system.run
-        if run.held_s is None or run.passage is not None:
+        if not is_measured:
             verdict = without_measured(verdict, expected.policy)
         verdict = self._without_passing_peers(verdict, stage)
         limits = unlimited(each.planned for each in system.run.processes.values())

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         AlivePublisher,
         AliveSubscription,
         PlanNotices,
+        Received,
     )
     from lifecycle.middleware.rcl.graph import GraphObserver
     from lifecycle.middleware.services.ros_interface import RosInterface
@@ -120,12 +121,18 @@ class ObserverParticipant:
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
         on_notice: Callable[[Mapping[str, str]], None],
+        on_times: Callable[[int, int, Received], None],
     ) -> AliveSubscription:
         """Watch the liveliness of another supervisor, or of a node that is attached."""
         from lifecycle.middleware.discovery.liveliness import AliveSubscription
 
         return AliveSubscription(
-            self._node, topic, on_liveliness=on_liveliness, on_left=on_left, on_notice=on_notice
+            self._node,
+            topic,
+            on_liveliness=on_liveliness,
+            on_left=on_left,
+            on_notice=on_notice,
+            on_times=on_times,
         )
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:

@@ -81,6 +81,12 @@ class Processes:
                 log=process.log.shown,
                 joins=system.run.held_s is not None,
                 measures=bool(system.plan.bounds),
+                apart=tuple(
+                    each.topic
+                    for each in system.plan.flows
+                    if each.publisher in system.remote
+                    and each.subscription in process.planned.nodes
+                ),
             )
             channel = ControlChannel(spec, system.on_host_event, hung)
         try:

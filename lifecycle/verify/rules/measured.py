@@ -11,15 +11,16 @@ A 5QI stands for its packet delay budget, which 98 % of the packets keep, and it
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import msgspec
 
 from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
-from lifecycle.measure.bounds import Bound, Judgement, Kind, judge
+from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
+from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.five_qi import five_qi_of
+from lifecycle.plan.model import Plan
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
@@ -30,7 +31,7 @@ PROBATION_S = 10.0
 """What can be decided at all in a system that was brought up is waited for this long."""
 
 _FIVE_QI_QUANTILE = 0.98
-_DELAYS = {Kind.DELAY, Kind.NETWORK_DELAY}
+_DELAYS = frozenset({Kind.DELAY, Kind.NETWORK_DELAY})
 
 
 def _rule(id_: str, meaning: str, fix: str) -> Rule:
@@ -126,6 +127,14 @@ def _of_five_qi(value: int) -> tuple[Bound, ...]:
     )
 
 
+def compares_clocks(plan: Plan) -> bool:
+    """Return whether a plan bounds delays, and data pass between its machines."""
+    machines = {node.key: node.machine for node in plan.nodes}
+    return any(machines[each.publisher] != machines[each.subscription] for each in plan.flows) and (
+        any(bound.kind in _DELAYS for number in plan.bounds for bound in bounds_of(number))
+    )
+
+
 class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A flow of which both ends are seen, and what is declared and counted of it.
 
@@ -133,6 +142,9 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         sample: what its subscription has counted; None where it is judged by another supervisor or
             cannot count.
         several: how many publishers its subscription has.
+        has_clocks: both ends are on one host, or a supervisor on each compares its clock.
+        clock: what is known of the clocks of all who publish to the subscription; None if one is
+            not known.
         own: numbers of its links and its publishers.
         of_topic: numbers of its subscription: they are of the topic, whoever publishes.
     """
@@ -140,6 +152,8 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     flow: FlowView
     sample: Sample | None
     several: int
+    has_clocks: bool
+    clock: ClockOffset | None
     own: tuple[Quantity, ...]
     of_topic: tuple[Quantity, ...]
 
@@ -161,7 +175,7 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             yield "128 to 254 are an operator's own classes"
         if not self.flow.nodes[1].is_ours and not self.flow.planned.measure:
             yield f"{self.flow.subscription} does not run in our host"
-        if kinds & _DELAYS and _differ(self.flow):
+        if kinds & _DELAYS and not self.has_clocks:
             yield "the clocks of the two hosts are not compared"
         one_publishers = kinds - _DELAYS
         if quantity in self.of_topic:
@@ -187,7 +201,8 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             for bound in bounds_of(quantity):
                 if bound not in seen:
                     seen.add(bound)
-                    yield quantity, bound, judge(bound, self.sample, publishes_s=publishes_s)
+                    judged = judge(bound, self.sample, publishes_s=publishes_s, clock=self.clock)
+                    yield quantity, bound, judged
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -224,7 +239,7 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
         if sample is None or not _is_active(view, flow):
             continue
         past = sample.last(seconds=DELAY_S)
-        clocks = not _differ(flow)
+        clock = each.clock
         found.append(
             FlowMeasurement(
                 topic=flow.planned.topic,
@@ -233,8 +248,9 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 messages=past.messages,
                 lost=None if sample.lost is None or each.several > 1 else past.lost,
                 rate_hz=past.rate_hz,
-                p50_ms=sample.used.quantile_ms(0.5) if clocks else None,
-                p99_ms=sample.used.quantile_ms(0.99) if clocks else None,
+                p50_ms=_corrected(sample, 0.5, clock),
+                p99_ms=_corrected(sample, 0.99, clock),
+                clock=clock if clock != SAME_CLOCK else None,
                 bounds=tuple(
                     _bound(quantity, judgement) for quantity, _, judgement in each.judgements(view)
                 ),
@@ -243,15 +259,27 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
     return tuple(found)
 
 
+def _corrected(sample: Sample, quantile: float, clock: ClockOffset | None) -> float | None:
+    """Return a quantile of delays as one clock shows them, milliseconds; None if not known."""
+    found = sample.used.quantile_ms(quantile)
+    return None if found is None or clock is None else max(0.0, found + clock.offset_ms)
+
+
 def _bound(quantity: Quantity, judgement: Judgement) -> MeasuredBound:
-    outcome = {None: "measuring", True: "ok", False: "violated"}[judgement.kept]
-    between = ", measuring " if judgement.observed and judgement.kept is None else " "
+    undecided = "unverifiable" if _is_given_up(judgement) else "measuring"
+    outcome = {None: undecided, True: "ok", False: "violated"}[judgement.kept]
+    between = f", {undecided} " if judgement.observed and judgement.kept is None else " "
     return MeasuredBound(
         name=quantity.name,
         outcome=outcome,
         text=f"{judgement.observed}{between}{judgement.allowed}".strip(),
         decides_in_s=judgement.decides_in_s,
     )
+
+
+def _is_given_up(judgement: Judgement) -> bool:
+    """Return whether a delay is not decided for the clocks of two hosts, and not before long."""
+    return judgement.needs_clocks and judgement.decides_in_s is None
 
 
 def _judged(view: View, each: _Counted) -> Iterator[Finding]:
@@ -264,6 +292,16 @@ def _judged(view: View, each: _Counted) -> Iterator[Finding]:
                 expected=str(quantity),
                 observed=judgement.observed,
                 message=f"{each.where}: {judgement.observed} {judgement.allowed}",
+                at=quantity.at,
+                ends=each.flow.ends,
+            )
+        elif _is_given_up(judgement) and view.clocks is not None:
+            why = _too_uncertain(quantity, bound, judgement, each)
+            yield NOT_MEASURED.finding(
+                subject=each.flow.subject,
+                expected=str(quantity),
+                observed=judgement.observed or "not measured",
+                message=f"{quantity} of {each.where} is not measured: {why}",
                 at=quantity.at,
                 ends=each.flow.ends,
             )
@@ -308,28 +346,75 @@ def _unmeasured_at(
 
 
 def _counted(view: View) -> list[_Counted]:
-    planned: Counter[tuple[str, str]] = Counter()
+    arriving: dict[tuple[str, str], list[FlowView]] = {}
     for flow in view.flows:
-        planned[flow.planned.topic, flow.subscription] += len(flow.publishers) or 1
-    found, topics = [], set()
-    for flow in view.flows:
-        if is_missing(flow):
-            continue
-        end = (flow.planned.topic, flow.subscription)
-        matched = [each.report.matched or 0 for each in flow.subscriptions if each.report]
-        published = (each for one in flow.publishers for each in one.planned.quantities)
-        of_topic = (each for one in flow.subscriptions for each in one.planned.quantities)
-        found.append(
-            _Counted(
+        arriving.setdefault((flow.planned.topic, flow.subscription), []).append(flow)
+    found = []
+    for flows in arriving.values():
+        planned = sum(len(each.publishers) or 1 for each in flows)
+        matched = [each.report.matched or 0 for each in flows[0].subscriptions if each.report]
+        of_topic = (each for one in flows[0].subscriptions for each in one.planned.quantities)
+        numbers = tuple(of_topic)
+        sample = _sample(view, flows[0])
+        for flow in flows:
+            if is_missing(flow):
+                continue
+            published = (each for one in flow.publishers for each in one.planned.quantities)
+            counted = _Counted(
                 flow=flow,
-                sample=_sample(view, flow),
-                several=max(planned[end], *matched, 1),
+                sample=sample,
+                several=max(planned, *matched, 1),
+                has_clocks=_has_clocks(view, flow),
+                clock=_clock(view, flows, sample),
                 own=(*flow.planned.quantities, *published),
-                of_topic=() if end in topics else tuple(of_topic),  # once, whoever publishes
+                of_topic=numbers,
             )
-        )
-        topics.add(end)
+            found.append(counted)
+            numbers = ()  # they are judged once, whoever publishes
     return found
+
+
+def _too_uncertain(quantity: Quantity, bound: Bound, judgement: Judgement, of: _Counted) -> str:
+    """Return why a delay is not decided, for what is known of the clocks of the two hosts."""
+    assert bound.most is not None
+    publisher, subscriber = (each.node.machine for each in of.flow.nodes)
+    clocks, clock = f"the clocks of {publisher} and {subscriber}", of.clock
+    if clock is None:
+        return f"{clocks} are not compared yet, or one was set a moment ago"
+    if clock.uncertainty_ms > bound.most:
+        named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
+        return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
+    found = f"{judgement.observed} may be more than {ms(bound.most)}, or not"
+    return f"{found}: {clocks} differ by {apart(clock)}"
+
+
+def _clock(view: View, flows: Sequence[FlowView], sample: Sample | None) -> ClockOffset | None:
+    """Return what is known of the clocks of all who publish to a subscription; None if one is not.
+
+    Nothing shows which of several publishers a message is from.
+
+    Args:
+        view: has the clocks.
+        flows: by which the subscription gets its messages.
+        sample: what it has counted.
+    """
+    far = {each.nodes[0].node.machine for each in flows if _differ(each)}
+    if not far:
+        return SAME_CLOCK
+    clocks = view.clocks or {}
+    # Where no shift is, it was counted as of this host's clock: the plan was another then.
+    if sample is None or sample.used.shift_ns is None or not far <= clocks.keys():
+        return None
+    near = [] if all(map(_differ, flows)) else [SAME_CLOCK]
+    return ClockOffset.any_of((*near, *(clocks[each] for each in far)))
+
+
+def _has_clocks(view: View, flow: FlowView) -> bool:
+    """Return whether a supervisor on each host of a flow compares its clock with the other's."""
+    machines = {each.node.machine for each in flow.nodes}
+    return not _differ(flow) or (
+        view.machines is not None and len(machines) == len(flow.nodes) and "" not in machines
+    )
 
 
 def _differ(flow: FlowView) -> bool:

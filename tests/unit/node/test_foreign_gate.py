@@ -62,7 +62,7 @@ def _node(activate: Any) -> ForeignNode:
     node = ForeignNode.__new__(ForeignNode)
     members: dict[str, Any] = {
         "node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
-        "_gate": NodeGate(),
+        "gate": NodeGate(),
         "_machine": Machine(activate),
         "_is_constructed": True,
         "_let_through": False,
@@ -84,7 +84,7 @@ def test_an_activate_that_does_not_succeed_leaves_the_gate_closed(activate: Any)
     node = _node(activate)
     with contextlib.suppress(RefusedError, SystemExit):
         asyncio.run(node.change_for_supervisor("activate"))
-    assert not node._gate.is_open
+    assert not node.gate.is_open
     assert not node.may_activate()
     assert node.reported.label == "inactive"
 
@@ -92,9 +92,9 @@ def test_an_activate_that_does_not_succeed_leaves_the_gate_closed(activate: Any)
 def test_one_that_succeeds_opens_it_and_a_second_changes_nothing() -> None:
     node = _node(lambda: Returned.SUCCESS)
     asyncio.run(node.change_for_supervisor("activate"))
-    assert node._gate.is_open
+    assert node.gate.is_open
     node._machine._activate = _refuse  # type: ignore[union-attr]
     with pytest.raises(RefusedError):
         asyncio.run(node.change_for_supervisor("activate"))
-    assert node._gate.is_open
+    assert node.gate.is_open
     assert node.may_activate()

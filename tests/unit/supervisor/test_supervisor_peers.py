@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,14 +14,15 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.cli.up_output import describe
-from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind
+from lifecycle.manifest.model import DiscoveryRange, Machine, Quantity, Run, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.middleware.discovery.liveliness import Received
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.comparison import decode, encode, notice_of
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, PlannedFlow
 from lifecycle.supervisor.core.state import install
 from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.peers import ANNOUNCED_S, Peers
+from lifecycle.supervisor.health.peers import ANNOUNCED_S, EXCHANGED_S, Peers
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import MachineConnection, NodeAlive, NodeSilent
 from lifecycle.verify.observation import Observation, ObservedNode
@@ -33,6 +35,7 @@ from tests.unit.supervisor.fakes import World, run
 DESK = supervisor_alive_topic("robot", "desk")
 VIEWER = Observation(nodes=(ObservedNode(full_name="/viewer"),))
 NOBODY = Observation()
+NS = 10**9
 
 
 def two_machines(system: str = "robot", *, log_level: str = "") -> Plan:
@@ -55,15 +58,19 @@ class FakeAir:
     def __init__(self) -> None:
         self.watched: dict[str, SimpleNamespace] = {}
         self.announced: dict[str, list[Mapping[str, str]]] = {}
+        self.received: list[Received] = []
         self.plans: list[str] = []
         self.arrives: Callable[[str], None] | None = None
         self.done: list[str] = []
 
     def announce_alive(self, topic: str) -> SimpleNamespace:
         said = self.announced.setdefault(topic, [])
-        return SimpleNamespace(
-            notify=lambda silent: said.append(dict(silent)), destroy=lambda: None
-        )
+
+        def notify(silent: Mapping[str, str], received: Received) -> None:
+            said.append(dict(silent))
+            self.received.append(dict(received))
+
+        return SimpleNamespace(notify=notify, destroy=lambda: None)
 
     def watch_alive(
         self,
@@ -72,11 +79,13 @@ class FakeAir:
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
         on_notice: Callable[[Mapping[str, str]], None],
+        on_times: Callable[[int, int, Received], None],
     ) -> SimpleNamespace:
         self.watched[topic] = SimpleNamespace(
             alive=on_liveliness,
             left=on_left,
             silent=on_notice,
+            times=on_times,
             destroy=lambda: self.watched.pop(topic),
         )
         return self.watched[topic]
@@ -497,3 +506,50 @@ async def test_the_newest_64_supervisors_are_kept(tmp_path: Path) -> None:
     assert len(subjects) == 64
     assert subjects[0].endswith("on machine 'machine_2'")
     assert subjects[-1].endswith("on machine 'machine_65'")
+
+
+def with_delay(plan: Plan) -> Plan:
+    """The plan with data from the robot to the desk that have to be there in time."""
+    number = Quantity(name="max_delay_ms", value=5.0, at=HERE)
+    flow = PlannedFlow(
+        topic="/video", publisher="camera", subscription="viewer", quantities=(number,)
+    )
+    return replace(plan, flows=(flow,))
+
+
+async def test_clocks_are_compared_once_a_second_while_a_delay_between_machines_is_declared(
+    tmp_path: Path,
+) -> None:
+    robot = Robot(tmp_path, with_delay(two_machines()))
+    assert robot.air.received == [{}]
+    now_ns = time.time_ns()
+    robot.desk.times(now_ns + NS, now_ns, {})
+    await settle()
+    assert robot.peers.clocks() == ()  # it has not received ours yet
+    await asyncio.sleep(1.1 * EXCHANGED_S)
+    assert robot.air.received[1:] == [{"desk": (now_ns + NS, now_ns)}]
+    # It got ours after 1 ms, and its answer was here after 1 ms, by a clock that is 1 s ahead.
+    sent_ns = now_ns + NS // 10
+    ours = {"robot": (sent_ns, sent_ns + NS + NS // 1000), "other": (1, 2)}
+    robot.desk.times(sent_ns + 2 * NS, sent_ns + NS + NS // 1000, ours)
+    await settle()
+    ((machine, offset),) = robot.peers.clocks()
+    assert machine == "desk"
+    assert abs(offset.offset_ns - NS) <= offset.uncertainty_ns < 2 * NS // 1000
+    robot.system.run.first = two_machines()
+    robot.peers.announce()
+    await asyncio.sleep(1.1 * EXCHANGED_S)
+    assert len(robot.air.received) == 2
+    await robot.peers.close()
+
+
+async def test_clocks_are_not_compared_where_no_delay_between_machines_is_declared(
+    tmp_path: Path,
+) -> None:
+    robot = Robot(tmp_path)
+    await asyncio.sleep(1.1 * EXCHANGED_S)
+    assert robot.air.received == []
+    robot.system.run.first = with_delay(two_machines())
+    robot.peers.announce()
+    assert robot.air.received == [{}]
+    await robot.peers.close()

@@ -1,0 +1,234 @@
+"""The clocks of two hosts: what exchanges prove of them, and delays counted across them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lifecycle.measure.bounds import CLOCKS_S, Bound, Judgement, Kind, judge
+from lifecycle.measure.clock import SAME_CLOCK, ClockComparison, ClockOffset
+from lifecycle.measure.counter import WARM_UP_S, Counter
+from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, least_ns, signed_bucket_of
+from lifecycle.measure.sample import DELAY_S, Sample
+
+NS = 10**9
+START = 1_700_000_000 * NS
+HOUR = 3600 * NS
+
+
+class Hosts:
+    """Two hosts and the way between them; times are of our clock.
+
+    Args:
+        ahead_ns: of the other's clock at START.
+        drift: by so much it goes faster.
+    """
+
+    def __init__(self, ahead_ns: int = 0, drift: float = 0.0) -> None:
+        self.ahead_ns, self.drift = ahead_ns, drift
+        self.comparison = ClockComparison()
+
+    def offset_ns(self, now_ns: int) -> int:
+        return self.ahead_ns + round((now_ns - START) * self.drift)
+
+    def exchange(self, now_ns: int, there_ns: int, waits_ns: int, back_ns: int) -> int:
+        """Exchange a message and, after a while, its answer; return when that is here."""
+        got, sent = now_ns + there_ns, now_ns + there_ns + waits_ns
+        here = sent + back_ns
+        theirs = got + self.offset_ns(got), sent + self.offset_ns(sent)
+        self.comparison.add(now_ns, *theirs, here)
+        return here
+
+    def known(self, now_ns: int) -> ClockOffset:
+        found = self.comparison.offset(now_ns)
+        assert found is not None
+        return found
+
+
+WAYS = st.tuples(st.integers(0, NS), st.integers(0, 2 * NS), st.integers(0, NS))
+
+
+@given(
+    st.integers(-HOUR, HOUR),
+    st.floats(-9e-5, 9e-5),
+    st.lists(WAYS, min_size=1, max_size=40),
+    st.integers(0, 100 * NS),
+)
+def test_the_true_offset_is_within_the_uncertainty_however_asymmetric_the_ways_are(
+    ahead_ns: int, drift: float, ways: list[tuple[int, int, int]], later_ns: int
+) -> None:
+    hosts, now_ns = Hosts(ahead_ns, drift), START
+    for way in ways:
+        now_ns = hosts.exchange(now_ns, *way)
+        found = hosts.known(now_ns)
+        assert abs(hosts.offset_ns(now_ns) - found.offset_ns) <= found.uncertainty_ns
+    now_ns += later_ns
+    found = hosts.known(now_ns)
+    for at_ns in (now_ns, now_ns - round(DELAY_S * NS)):
+        assert abs(hosts.offset_ns(at_ns) - found.offset_ns) <= found.uncertainty_ns
+
+
+def test_the_uncertainty_is_half_of_the_shortest_round_trip_and_what_clocks_may_drift() -> None:
+    hosts = Hosts(500_000_000)
+    for second, slow_ns in enumerate((40_000_000, 0, 3_000_000, 40_000_000)):
+        now_ns = hosts.exchange(START + second * NS, 100_000 + slow_ns, 0, 100_000 + slow_ns)
+    found = hosts.known(now_ns)
+    assert found.offset_ns == pytest.approx(500_000_000, abs=1000)
+    assert 100_000 < found.uncertainty_ns < 100_000 + 100e-6 * 5 * NS
+    assert hosts.known(now_ns + 10 * NS).uncertainty_ns - found.uncertainty_ns == pytest.approx(
+        100e-6 * 10 * NS, rel=0.5
+    )
+
+
+def test_nothing_is_known_before_an_exchange_and_little_memory_is_used() -> None:
+    hosts = Hosts()
+    assert hosts.comparison.offset(START) is None
+    for second in range(1000):
+        hosts.exchange(START + second * NS, 1000, 0, 1000)
+    assert len(hosts.comparison._exchanges) < 10
+
+
+@pytest.mark.parametrize("step_ns", [500_000_000, -500_000_000, HOUR, -HOUR])
+def test_a_clock_that_is_set_makes_what_was_known_of_it_void_until_old_delays_are_gone(
+    step_ns: int,
+) -> None:
+    hosts = Hosts(7_000_000)
+    for second in range(5):
+        now_ns = hosts.exchange(START + second * NS, 200_000, 0, 200_000)
+    hosts.ahead_ns += step_ns
+    now_ns = hosts.exchange(now_ns + NS, 200_000, 0, 200_000)
+    assert hosts.comparison.offset(now_ns) is None
+    for _ in range(6):
+        now_ns = hosts.exchange(now_ns + NS, 200_000, 0, 200_000)
+    assert hosts.known(now_ns).offset_ns == pytest.approx(7_000_000 + step_ns, abs=500_000)
+
+
+def test_an_exchange_during_which_a_clock_was_set_back_proves_nothing() -> None:
+    comparison = ClockComparison()
+    comparison.add(START, START, START + 10, START - NS)
+    comparison.add(START, START, START + NS, START + 10)
+    assert comparison.offset(START) is None
+
+
+def test_of_several_clocks_holds_what_holds_for_each() -> None:
+    far = ClockOffset(offset_ns=1_000_000, uncertainty_ns=200_000)
+    assert ClockOffset.any_of([far]) == far
+    assert ClockOffset.any_of([SAME_CLOCK]) == SAME_CLOCK
+    both = ClockOffset.any_of([SAME_CLOCK, far])
+    assert (both.offset_ns, both.uncertainty_ns) == (600_000, 600_000)
+
+
+@given(st.integers(-LONGEST_NS, LONGEST_NS))
+def test_a_bucket_of_a_difference_holds_it_within_the_known_error(delay_ns: int) -> None:
+    bucket = signed_bucket_of(delay_ns)
+    assert least_ns(bucket) <= delay_ns <= least_ns(bucket) + abs(delay_ns) * ERROR + 1
+    assert abs(bucket) <= LAST_BUCKET
+    assert signed_bucket_of(delay_ns - 1) <= bucket
+
+
+def counted(
+    arrivals: Iterable[tuple[float, float]], *, ahead_ns: int, until_s: float, network: float = 0.5
+) -> Sample:
+    """Count messages of another host: seconds of arrival, and delay in ms, a share on the way."""
+    counter = Counter(0, START, is_apart=True)
+    for number, (at_s, delay_ms) in enumerate(arrivals, 1):
+        now_ns = round((at_s + WARM_UP_S) * NS)
+        sent_ns = START + now_ns - round(delay_ms * 1e6)
+        info = {
+            "source_timestamp": sent_ns + ahead_ns,
+            "received_timestamp": sent_ns + round(delay_ms * network * 1e6),
+            "publication_sequence_number": number,
+        }
+        counter.arrived(now_ns, START + now_ns, info)
+        if number % 25 == 0:
+            counter.count()
+    return counter.sample(round((until_s + WARM_UP_S) * NS))
+
+
+def steady(delay_ms: float, seconds: float = 5.0) -> list[tuple[float, float]]:
+    return [((number + 0.5) / 50, delay_ms) for number in range(round(seconds * 50))]
+
+
+FAR = st.integers(-(10**6) * HOUR, 10**6 * HOUR)
+
+
+@given(FAR, st.lists(st.floats(0.01, 60), min_size=1, max_size=12))
+def test_delays_across_clocks_are_exact_within_the_known_error(
+    ahead_ns: int, delays_ms: list[float]
+) -> None:
+    arrivals = [
+        (at_s, delay_ms)
+        for (at_s, _), delay_ms in zip(steady(0), itertools.cycle(delays_ms), strict=False)
+    ]
+    sample = counted(arrivals, ahead_ns=ahead_ns, until_s=5, network=1.0)
+    assert sample.messages == len(arrivals)
+    exact_ms = sorted(each for _, each in arrivals[-sample.used.messages :])
+    for quantile in (0.5, 0.9, 0.99):
+        found_ms = sample.used.quantile_ms(quantile)
+        assert found_ms is not None
+        rank = math.ceil(quantile * len(exact_ms) - 1e-9)
+        # A double has milliseconds of centuries to a part of a microsecond.
+        assert found_ms + ahead_ns / 1e6 == pytest.approx(
+            exact_ms[rank - 1], abs=max(delays_ms) * ERROR + 2e-3
+        )
+
+
+@pytest.mark.parametrize("ahead_ns", [500_000_000, -500_000_000, 10**5 * HOUR, -(10**5) * HOUR])
+def test_rate_and_loss_do_not_depend_on_the_other_clock(ahead_ns: int) -> None:
+    sample = counted(steady(3.0), ahead_ns=ahead_ns, until_s=5)
+    assert (sample.messages, sample.lost) == (250, 0)
+    found_ms = sample.received.quantile_ms(0.99)
+    assert found_ms is not None
+    assert found_ms + ahead_ns / 1e6 == pytest.approx(1.5, abs=0.05)
+
+
+def test_small_delays_keep_small_buckets_after_long_ones_or_a_clock_that_was_set_back() -> None:
+    late = [(at_s, 4000.0) for at_s, _ in steady(0, 1)]
+    then = [(1 + at_s, 3.0) for at_s, _ in steady(3.0)]
+    sample = counted([*late, *then], ahead_ns=0, until_s=6, network=1.0)
+    assert sample.used.quantile_ms(0.99) == pytest.approx(3.0, abs=0.01)
+    assert sample.messages == 300
+
+
+BOUND = Bound(kind=Kind.DELAY, most=5.0)
+
+
+def judged(delay_ms: float, uncertainty_ms: float, seconds: float = 9.0) -> Judgement:
+    clock = ClockOffset(offset_ns=512_000_000, uncertainty_ns=round(uncertainty_ms * 1e6))
+    sample = counted(steady(delay_ms, seconds), ahead_ns=512_000_000, until_s=seconds)
+    return judge(BOUND, sample, clock=clock)
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "uncertainty_ms", "kept"),
+    [
+        (1.0, 0.2, True),
+        (4.9, 0.2, None),
+        (5.1, 0.2, None),
+        (5.3, 0.2, False),
+        (1.0, 6.0, None),  # even if no delay is less than 0 ms
+        (50.0, 6.0, False),  # however the clocks are, that is too late
+    ],
+)
+def test_a_delay_is_decided_only_where_the_clocks_do_not_matter(
+    delay_ms: float, uncertainty_ms: float, kept: bool | None
+) -> None:
+    found = judged(delay_ms, uncertainty_ms)
+    assert found.kept is kept
+    assert found.needs_clocks is (kept is None)
+    assert found.decides_in_s is None
+
+
+def test_better_exchanges_are_waited_for_within_the_probation() -> None:
+    found = judged(4.9, 0.2, 5.5)
+    assert (found.kept, found.needs_clocks) == (None, True)
+    assert found.decides_in_s == pytest.approx(CLOCKS_S - 5.5)
+    sample = counted(steady(1.0, 5.5), ahead_ns=0, until_s=5.5)
+    unknown = judge(BOUND, sample, clock=None)
+    assert (unknown.kept, unknown.needs_clocks, unknown.observed) == (None, True, "")
+    assert judged(1.0, 0.25).observed == "delay p99 1 ms ± 0.25 ms"
