@@ -91,7 +91,8 @@ class Counter:
         with self._lock:
             noted = [self._noted.popleft() for _ in range(len(self._noted))]
             if self._is_apart and self._shift_ns is None:
-                new = (each for each in noted if self._is_new(each[1], each[2], each[3], WARM_UP_S))
+                since_ns = self._published_ns - int(WARM_UP_S * _NS)
+                new = (each for each in noted if (each[3] or each[1]) >= since_ns)
                 self._shift_ns = min((each[1] - each[2] for each in new), default=None)
             for each in noted:
                 self._count(*each)
@@ -130,23 +131,14 @@ class Counter:
             Delays.of((each[1] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
         )
 
-    def _is_new(
-        self, wall_ns: int, source_ns: int, received_ns: int, earlier_s: float = 0.0
-    ) -> bool:
-        """Return whether a message was published after counting began, or so much earlier.
-
-        Of another host's clock that is not known: then when it was received.
-        """
-        if self._is_apart:
-            source_ns = received_ns if received_ns > 0 else wall_ns
-        return source_ns >= self._published_ns - earlier_s * _NS
-
     def _count(
         self, now_ns: int, wall_ns: int, source_ns: int, received_ns: int, number: int
     ) -> None:
         numbered = 0 < number < _UNNUMBERED
         before, self._last_number = self._last_number, number
-        if now_ns < self._since_ns or not self._is_new(wall_ns, source_ns, received_ns):
+        # When it was published is not known by another clock, but when it was received.
+        at_ns = (received_ns or wall_ns) if self._is_apart else source_ns
+        if at_ns < self._published_ns or now_ns < self._since_ns:
             return
         self._close_slots(now_ns)
         self._last_ns = now_ns
@@ -164,11 +156,12 @@ class Counter:
             delay_ns = 0
             self._all, self._used, self._received = {}, {}, {}
             self._delays.clear()
-        bucket = self._bucket_of(delay_ns)
+        bucket_of = self._bucket_of
+        bucket = bucket_of(delay_ns)
         self._used[bucket] = self._used.get(bucket, 0) + 1
         self._all[bucket] = self._all.get(bucket, 0) + 1
         if received_ns > 0:
-            bucket = self._bucket_of(received_ns - source_ns - shift_ns)
+            bucket = bucket_of(received_ns - source_ns - shift_ns)
             self._received[bucket] = self._received.get(bucket, 0) + 1
 
     def _close_slots(self, now_ns: int) -> None:

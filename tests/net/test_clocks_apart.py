@@ -1,0 +1,112 @@
+"""Delays between two hosts whose clocks are half a second apart."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.control.client import look
+from lifecycle.verify.verdict import FlowMeasurement
+from tests.net.hosts import Host
+from tests.net.other_clock import other_clock
+from tests.net.running import article, run_directory, up_on
+from tests.ros.supervisor.running import Up
+
+_BOUND_MS = 40
+"""Kept on a machine that is busy, too, and far less than the clocks are apart."""
+
+_EDIT = {
+    "nodes/n1/run": {"python": "tests.net.systems:Stamped"},
+    "nodes/n2/run": {"python": "tests.net.systems:Timed"},
+    "links": [
+        {"topic": "/video", "from": "n1", "to": "n2", "max_delay_ms": _BOUND_MS},
+        {"topic": "/battery", "from": "n1", "to": "n2"},
+    ],
+}
+_SAID = r"delay p99 [\d.]+ ms ± [\d.]+ ms ≤ 40 ms.*, clocks (499|50[01]) ms ± [\d.]+ ms apart"
+_SIM_TIME = {
+    "nodes/n2/parameters": {"use_sim_time": True},
+    "nodes/clock": {
+        "machine": "a",
+        "run": {"python": "tests.net.systems:SimulatedTime"},
+        "interface": {
+            "publishers": [{"name": "/clock", "type": "rosgraph_msgs/msg/Clock", "qos": "clock"}]
+        },
+    },
+}
+
+
+@contextlib.contextmanager
+def _apart(
+    pair: tuple[Host, Host], directory: Path, ahead_s: float, edit: Mapping[str, Any]
+) -> Iterator[tuple[Up, Up]]:
+    """Bring the article up with the clock of its publisher's host ahead."""
+    manifest = article(directory, pair[0].ipv4, pair[1].ipv4, edit={**_EDIT, **edit})
+    clock: Mapping[str, str] = other_clock(directory, ahead_s)
+    with (
+        up_on(
+            pair[0], manifest, "--machine", "a", runtime=directory / "a", variables=clock
+        ) as up_a,
+        up_on(pair[1], manifest, "--machine", "b", runtime=directory / "b") as up_b,
+    ):
+        yield up_a, up_b
+
+
+def _measured(directory: Path, machine: str) -> FlowMeasurement | None:
+    """Return what a supervisor knows of the video now."""
+    verdict = look(run_directory(directory / machine, machine)).verdict
+    assert verdict is not None
+    return next((each for each in verdict.measured if each.topic == "/video"), None)
+
+
+@pytest.mark.parametrize("ahead_s", [0.5, -0.5])
+@pytest.mark.parametrize("edit", [{}, _SIM_TIME], ids=["", "use_sim_time"])
+def test_a_delay_that_is_kept_is_ok_with_numbers_whatever_the_clocks_say(
+    pair: tuple[Host, Host], tmp_path: Path, ahead_s: float, edit: dict[str, Any]
+) -> None:
+    with _apart(pair, tmp_path, ahead_s, edit=edit) as (up_a, up_b):
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        said = up_b.until("notice")
+        while not str(said["message"]).startswith("measured: /video"):
+            said = up_b.until("notice")
+        assert re.search(_SAID, str(said["message"])), said
+        up_b.catch_up()
+        true_ms = float(str(up_b.until("log")["line"]).removeprefix("median "))
+        flow = _measured(tmp_path, "b")
+        # Who publishes counts nothing, and judges nothing.
+        assert _measured(tmp_path, "a") is None
+        for up in (up_a, up_b):
+            up.signal(signal.SIGTERM)
+        assert [up.finish() for up in (up_a, up_b)] == [ExitCode.OK, ExitCode.OK]
+    assert flow is not None
+    assert flow.clock is not None
+    assert abs(flow.clock.offset_ms - ahead_s * 1000) <= flow.clock.uncertainty_ms < 10
+    assert flow.p50_ms is not None
+    assert abs(flow.p50_ms - true_ms) <= flow.clock.uncertainty_ms + 1
+    assert [each.outcome for each in flow.bounds] == ["ok"]
+    print(f"true {true_ms} ms, {flow.describe()}")
+
+
+@pytest.mark.parametrize("ahead_s", [0.5, -0.5])
+def test_data_that_are_used_late_are_found_whatever_the_clocks_say(
+    pair: tuple[Host, Host], tmp_path: Path, ahead_s: float
+) -> None:
+    edit = {"nodes/n2/run/environment": {"BUSY_S": "0.15"}}
+    with _apart(pair, tmp_path, ahead_s, edit=edit) as (up_a, up_b):
+        verdict = up_b.until_found("flow.delay")
+        (found,) = (each for each in verdict["findings"] if each["rule"] == "flow.delay")
+        said = re.search(r"delay p99 ([\d.]+) ms ± [\d.]+ ms > 40 ms", found["message"])
+        assert said is not None, found
+        assert 80 < float(said[1]) < 200
+        for up in (up_a, up_b):
+            up.signal(signal.SIGTERM)
+        up_a.finish()
+        assert up_b.finish() == ExitCode.VIOLATED
