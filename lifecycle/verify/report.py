@@ -317,9 +317,10 @@ def to_github(verdict: Verdict, *, strict: bool = False) -> str:
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
     """Write `{"verdict": …, "findings": [...], "flows": [...]}`.
 
-    There are `open_endpoints` and `tolerated`, too, where there are any. The last verdict of a run
-    has `run`: why it ended, how far it came, its exit code, and what its gate took on trust, if
-    anything. Where no system was judged it has `"judged": false`, and its findings are why.
+    There are `open_endpoints`, `tolerated` and `measured`, too, where there are any. The last
+    verdict of a run has `run`: why it ended, how far it came, its exit code, and what its gate took
+    on trust, if anything. Where no system was judged it has `"judged": false`, and its findings are
+    why.
 
     Args:
         verdict: what to write.
@@ -336,6 +337,8 @@ def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
         document["open_endpoints"] = codec.to_plain(verdict.open_endpoints)
     if verdict.tolerated:
         document["tolerated"] = codec.to_plain(verdict.tolerated)
+    if verdict.measured:
+        document["measured"] = codec.to_plain(verdict.measured)
     if verdict.run is not None:
         run = codec.to_plain(verdict.run)
         assert isinstance(run, dict)

@@ -17,10 +17,10 @@ from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
 from lifecycle.measure.bounds import RATE_SLACK, Bound, Judgement, Kind, judge
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.five_qi import five_qi_of
-from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.outcome import FlowMeasurement, MeasuredBound, Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
-from lifecycle.verify.verdict import Finding, FlowMeasurement, MeasuredBound, Stage
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, brings_up
 
 PROBATION_S = 10.0
@@ -166,21 +166,23 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 p50_ms=sample.used.quantile_ms(0.5) if clocks else None,
                 p99_ms=sample.used.quantile_ms(0.99) if clocks else None,
                 bounds=tuple(
-                    _bound(quantity, judgement)
-                    for quantity, _, judgement in _judgements(view, flow, sample)
+                    _bound(quantity, bound, judgement)
+                    for quantity, bound, judgement in _judgements(view, flow, sample)
                 ),
             )
         )
     return tuple(found)
 
 
-def _bound(quantity: Quantity, judgement: Judgement) -> MeasuredBound:
+def _bound(quantity: Quantity, bound: Bound, judgement: Judgement) -> MeasuredBound:
     outcome = {None: "measuring", True: "ok", False: "violated"}[judgement.kept]
     between = ", measuring " if judgement.observed and judgement.kept is None else " "
     return MeasuredBound(
         name=quantity.name,
+        kind=bound.kind,
         outcome=outcome,
         text=f"{judgement.observed}{between}{judgement.allowed}".strip(),
+        share=judgement.share,
         decides_in_s=judgement.decides_in_s,
     )
 
