@@ -20,6 +20,8 @@ from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     PROCESS_KEYS,
+    QUANTILE,
+    RATE_SLACK,
     After,
     Condition,
     ConnectionDeclaration,
@@ -38,6 +40,7 @@ from lifecycle.manifest.model import (
     ParameterValue,
     PublisherFlow,
     Quantity,
+    Rate,
     Reaction,
     Resources,
     Run,
@@ -433,6 +436,7 @@ def _flows(node: Cursor) -> list[FlowNeed]:
                     dscp=None if wanted.dscp is None else wanted.dscp.value,
                     five_qi=None if five_qi == "auto" else five_qi,
                     five_qi_auto=five_qi == "auto",
+                    rate_hz=_carried_hz(wanted.rate_hz),
                     quantities=quantities(cursor),
                     at=cursor.key_at,
                 )
@@ -440,8 +444,13 @@ def _flows(node: Cursor) -> list[FlowNeed]:
     return needs
 
 
-_QUANTITIES = ("max_delay_ms", "loss", "rate_hz", "max_message_size", "five_qi")
-"""Numbers of a flow or a link that nothing but a measurement could prove."""
+def _carried_hz(rate: float | Rate | None) -> float | None:
+    """Return the messages per second that a network must carry."""
+    return rate.max or rate.min if isinstance(rate, Rate) else rate
+
+
+_QUANTITIES = ("max_delay_ms", "loss", "max_silence_s", "max_message_size", "five_qi")
+"""Numbers of a flow or a link that nothing but a measurement could prove; and its rate."""
 
 
 def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
@@ -450,10 +459,20 @@ def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
     `five_qi: auto` is none: it follows from the others.
     """
     found = []
+    share = cursor.get("quantile")
+    quantile = QUANTILE if share is None else float(share.value.text)
     for name in _QUANTITIES:
         value = cursor.get(name)
         if value is not None and isinstance(value.scalar, (int, float)):
-            found.append(Quantity(name=name, value=value.scalar, at=value.at))
+            of = quantile if name == "max_delay_ms" else QUANTILE
+            found.append(Quantity(name=name, value=value.scalar, at=value.at, quantile=of))
+    rate = cursor.get("rate_hz")
+    if rate is not None and isinstance(rate.value.data, Mapping):
+        both = rate.build(Rate)
+        found.append(Quantity(name="rate_hz", value=both.min or 0.0, most=both.max, at=rate.at))
+    elif rate is not None:
+        hertz = float(rate.value.text)
+        found.append(Quantity(name="rate_hz", value=hertz, slack=RATE_SLACK, at=rate.at))
     return tuple(found)
 
 

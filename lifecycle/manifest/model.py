@@ -210,6 +210,7 @@ NodeKey = Annotated[
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
+Hertz = Annotated[float, Meta(gt=0, le=1_000_000)]
 UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
@@ -536,31 +537,75 @@ class Interface(msgspec.Struct, frozen=True, kw_only=True):
         return next((e for e in self.endpoints if e.kind is kind and e.name == name), None)
 
 
+QUANTILE = 0.99
+"""Share of the messages that a delay is declared of, where the manifest does not say."""
+
+RATE_SLACK = 0.05
+"""Share of a plain `rate_hz` that may be missing: timers and clocks are not that exact."""
+
+
+class Rate(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How often messages arrive.
+
+    Attributes:
+        min: Fewest messages per second.
+        max: Most messages per second.
+    """
+
+    min: Hertz | None = None
+    max: Hertz | None = None
+
+
+class MeasuredKeys(msgspec.Struct, frozen=True, kw_only=True):
+    """What is measured where data arrive, in nodes that are run by us, once they are active.
+
+    Attributes:
+        max_delay_ms: Longest delay from publication to the start of the callback, milliseconds.
+        quantile: Share of the messages that must keep 'max_delay_ms'.
+        loss: Highest share of messages lost that this flow bears.
+        rate_hz: Messages per second, of which 5 % may be missing; or 'min' and 'max', exactly.
+        max_silence_s: Longest time without a message, seconds.
+    """
+
+    max_delay_ms: Milliseconds | None = None
+    quantile: Annotated[float, Meta(gt=0, lt=1)] = QUANTILE
+    loss: Annotated[float, Meta(gt=0, le=1)] | None = None
+    rate_hz: Hertz | Rate | None = None
+    max_silence_s: Seconds | None = None
+
+
 class Quantity(msgspec.Struct, frozen=True, kw_only=True):
     """A number that a manifest promises or asks for, and where it is written.
 
     Attributes:
         name: the manifest's key, which has the unit: `max_delay_ms`, `rate_hz`, `five_qi`.
-        most: upper bound of a rate that has both; None without.
-        quantile: of a delay.
+        value: of a rate its lower bound; 0 where only `max` is written.
+        most: upper bound of a rate; None without.
+        slack: share of the lower bound of a rate that may be missing.
+        quantile: of a delay: the share of the messages that must not exceed it.
     """
 
     name: str
     value: float
     at: Position
     most: float | None = None
-    quantile: float = 0.99
+    slack: float = 0.0
+    quantile: float = QUANTILE
 
     def __str__(self) -> str:
-        """Return `max_delay_ms 5`."""
-        return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
+        """Return `max_delay_ms 5`, `rate_hz {min: 10, max: 20}`."""
+        if self.most is not None:
+            least = f"min: {self.value:g}, " if self.value else ""
+            return f"{self.name} {{{least}max: {self.most:g}}}"
+        share = f" for {self.quantile:.6g}" if self.quantile != QUANTILE else ""
+        return f"{self.name} {self.value:.15g}{share}"
 
 
 class Dscp(Special):
     """A differentiated services code point: a name (RFC 2474, 2597, 3246, …) or 0 to 63."""
 
 
-class SubscriptionFlow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SubscriptionFlow(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One subscription's flow.
 
     Attributes:
@@ -598,10 +643,8 @@ class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
             Without a mapping it is the TOS byte.
         five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
             'max_delay_ms', 'loss' and 'rate_hz' and says why.
-        max_delay_ms: Longest delay that this flow bears, milliseconds; that of the links of its
-            topic if left out.
-        loss: Highest share of messages lost or late that this flow bears.
-        rate_hz: Messages per second.
+        max_delay_ms: Longest delay from publication to the start of the callback, milliseconds;
+            that of the links of its topic if left out.
         max_message_size: Largest serialized message, bytes; the bound of its type, where all its
             fields have one, if left out.
         non_blocking_send: Never wait for room in the socket's buffer: what finds it full is lost,
@@ -609,9 +652,6 @@ class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
     """
 
     five_qi: Literal["auto"] | Annotated[int, Meta(ge=1, le=254)] | None = None
-    max_delay_ms: Milliseconds | None = None
-    loss: Annotated[float, Meta(gt=0, le=1)] | None = None
-    rate_hz: Annotated[float, Meta(gt=0, le=1_000_000)] | None = None
     max_message_size: Annotated[int, Meta(ge=1, le=2**32 - 1)] | None = None
     non_blocking_send: bool = False
 
@@ -626,6 +666,7 @@ class FlowNeed(PublisherFlow, frozen=True, kw_only=True):
             `transport_priority`.
         five_qi: None if not asked for, or left to us.
         five_qi_auto: `five_qi: auto`: the planner proposes one.
+        rate_hz: messages per second that a network must carry: the upper bound where it has one.
         quantities: each of its numbers that only a measurement could prove, as it is written.
     """
 
@@ -634,6 +675,7 @@ class FlowNeed(PublisherFlow, frozen=True, kw_only=True):
     dscp: int | None = None  # type: ignore[assignment]
     five_qi: int | None = None
     five_qi_auto: bool = False
+    rate_hz: float | None = None
     quantities: tuple[Quantity, ...] = ()
     at: Position
 
@@ -873,6 +915,7 @@ RULE_IDS = tuple(
         ("endpoint", "error"),
         ("flow", "unreported not-unique unverifiable broken-endpoint not-measured"),
         ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable"),
+        ("flow", "delay rate loss silent nothing-arrived"),
         ("state", "wrong-state unverifiable activated-at-closed-gate"),
         ("node", "unhealthy without-health"),
         ("config", "missing-report incomplete-report"),
@@ -944,7 +987,7 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return self.ros_interface or RosInterfaceAccess.READ_ONLY
 
 
-class LinkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LinkKeys(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One link.
 
     Attributes:
@@ -952,7 +995,6 @@ class LinkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         from: Key of the publishing node.
         to: Key of the subscribing node.
         unique: How unique the flow between them must be.
-        max_delay_ms: Longest delay allowed, milliseconds.
         transport: What carries it: what the planner chooses (any), an IP socket (network), shared
             memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
             host (multicast), TCP (tcpv4).
@@ -962,7 +1004,6 @@ class LinkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     from_node: NodeKey = msgspec.field(name="from")
     to_node: NodeKey = msgspec.field(name="to")
     unique: UniqueHow = UniqueHow.NOT
-    max_delay_ms: Milliseconds | None = None
     transport: FlowTransport = FlowTransport.ANY
 
 

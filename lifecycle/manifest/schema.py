@@ -224,9 +224,10 @@ def _types(value: object, types: list[str]) -> tuple[str, str]:
 
 def _range(schema: Mapping[str, Any]) -> str:
     low, above, high = (schema.get(k) for k in ("minimum", "exclusiveMinimum", "maximum"))
+    below = schema.get("exclusiveMaximum")
     lower = f"more than {above}" if above is not None else f"{low}"
-    upper = f"at most {high}" if above is not None else f"{high}"
-    return f"{lower}, {upper}" if above is not None else f"{lower} to {upper}"
+    upper = f"less than {below}" if below is not None else f"at most {high}"
+    return f"{lower}, {upper}" if above is not None else f"{lower} to {high}"
 
 
 def _closest(value: object, allowed: list[object]) -> str:

@@ -14,9 +14,6 @@ import msgspec
 from lifecycle.measure.delays import Delays
 from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, Sample
 
-RATE_SLACK = 0.05
-"""A plain `rate_hz` is a lower bound with this slack."""
-
 RATE_S = 2.0
 RATE_PERIODS = 20
 LOSS_EVENTS = 10

@@ -16,6 +16,7 @@ from lifecycle.manifest.checks import (
     flows,
     names,
     nodes,
+    numbers,
     parameters,
     transport,
 )
@@ -31,6 +32,7 @@ CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
     *parameters.CHECKS,
     *connection_urls.CHECKS,
     *flows.CHECKS,
+    *numbers.CHECKS,
     *transport.CHECKS,
 )
 

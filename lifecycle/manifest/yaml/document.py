@@ -251,6 +251,8 @@ def _converted(value: Value, hint: Any) -> Any:
     if isinstance(value.data, tuple):
         return tuple(each.text for each in value.data)
     number = value.data
+    if isinstance(number, Mapping):
+        return msgspec.convert(value.plain(), hint, strict=False)
     if isinstance(number, float) and number.is_integer() and abs(number) < _EXACT:
         number = int(number)  # JSON Schema counts 5.0 as an integer
     return msgspec.convert(number, hint)

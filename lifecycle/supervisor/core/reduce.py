@@ -445,8 +445,11 @@ def _hold(run: Run) -> list[Event]:
 def _measured(run: Run) -> list[Event]:
     """Say what was measured of each flow of which a number is declared."""
     verdict = run.judged.verdict
-    flows = () if verdict is None else verdict.measured
-    return [Notice(message=f"measured: {each.describe()}") for each in flows if each.bounds]
+    if verdict is None or not verdict.measured:
+        return []
+    flows = (each for each in verdict.measured if each.bounds)
+    said = [Notice(message=f"measured: {each.describe()}") for each in flows]
+    return [VerdictChanged(stage=advance.stage_of(run), verdict=verdict), *said]
 
 
 def _returned(run: Run) -> list[Event]:

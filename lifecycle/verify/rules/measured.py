@@ -11,10 +11,13 @@ A 5QI stands for its packet delay budget, which 98 % of the packets keep, and it
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import msgspec
 
 from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
-from lifecycle.measure.bounds import RATE_SLACK, Bound, Judgement, Kind, judge
+from lifecycle.measure.bounds import Bound, Judgement, Kind, judge
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.verify.outcome import FlowMeasurement, MeasuredBound, Outcome
@@ -27,6 +30,7 @@ PROBATION_S = 10.0
 """What can be decided at all in a system that was brought up is waited for this long."""
 
 _FIVE_QI_QUANTILE = 0.98
+_DELAYS = {Kind.DELAY, Kind.NETWORK_DELAY}
 
 
 def _rule(id_: str, meaning: str, fix: str) -> Rule:
@@ -97,8 +101,9 @@ def bounds_of(quantity: Quantity) -> tuple[Bound, ...]:
     if quantity.name == "max_delay_ms":
         return (Bound(kind=Kind.DELAY, most=value, quantile=quantity.quantile),)
     if quantity.name == "rate_hz":
-        slack = RATE_SLACK if quantity.most is None else 0.0
-        return (Bound(kind=Kind.RATE, least=value, most=quantity.most, slack=slack),)
+        return (
+            Bound(kind=Kind.RATE, least=value or None, most=quantity.most, slack=quantity.slack),
+        )
     if quantity.name == "loss":
         return (Bound(kind=Kind.LOSS, most=value),)
     if quantity.name == "max_silence_s":
@@ -121,36 +126,101 @@ def _of_five_qi(value: int) -> tuple[Bound, ...]:
     )
 
 
+class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A flow of which both ends are seen, and what is declared and counted of it.
+
+    Attributes:
+        sample: what its subscription has counted; None where it is judged by another supervisor or
+            cannot count.
+        several: how many publishers its subscription has.
+        own: numbers of its links and its publishers.
+        of_topic: numbers of its subscription: they are of the topic, whoever publishes.
+    """
+
+    flow: FlowView
+    sample: Sample | None
+    several: int
+    own: tuple[Quantity, ...]
+    of_topic: tuple[Quantity, ...]
+
+    @property
+    def where(self) -> str:
+        """How messages name it."""
+        flow = self.flow
+        return f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+
+    def why_not(self, quantity: Quantity) -> str:
+        """Return why a number of it cannot be measured; empty if it can."""
+        return next(self._reasons(quantity), "")
+
+    def _reasons(self, quantity: Quantity) -> Iterator[str]:
+        kinds = {each.kind for each in bounds_of(quantity)}
+        if quantity.name == "max_message_size":
+            yield "a callback does not show the size of a message"
+        elif not kinds:
+            yield "128 to 254 are an operator's own classes"
+        if not self.flow.nodes[1].is_ours:
+            yield f"{self.flow.subscription} does not run in our host"
+        if kinds & _DELAYS and _differ(self.flow):
+            yield "the clocks of the two hosts are not compared"
+        one_publishers = kinds - _DELAYS
+        if quantity in self.of_topic:
+            one_publishers &= {Kind.LOSS}
+        if self.several > 1 and one_publishers:
+            yield f"nothing shows which of the {self.several} publishers of the topic sent what"
+        if Kind.LOSS in kinds and self.sample is not None and self.sample.lost is None:
+            yield "its RMW gives messages no publication sequence numbers"
+
+    def judgements(self, view: View) -> Iterator[tuple[Quantity, Bound, Judgement]]:
+        """Judge each of its numbers that can be measured, the same one only once."""
+        if self.sample is None:
+            return
+        publisher = self.flow.nodes[0]
+        report = publisher.configuration
+        measured = None if report is None else report.measured
+        near = brings_up(publisher.node, view.machines)
+        publishes_s = measured.active_s if measured is not None and near else None
+        seen: set[Bound] = set()
+        for quantity in (*self.own, *self.of_topic):
+            if self.why_not(quantity):
+                continue
+            for bound in bounds_of(quantity):
+                if bound not in seen:
+                    seen.add(bound)
+                    yield quantity, bound, judge(bound, self.sample, publishes_s=publishes_s)
+
+
 def check(view: View) -> Iterator[Finding]:
     """Judge every number that is declared of a flow, or name it as not measured."""
+    counted = _counted(view)
+    of_end: dict[int, list[_Counted]] = {}
+    for each in counted:
+        for end in (*each.flow.publishers, *each.flow.subscriptions):
+            of_end.setdefault(id(end), []).append(each)
     for actual in view.actual:
-        if actual.planned.kind is EndpointKind.PUBLISHER and _is_there(actual):
-            flows = [flow for flow in view.flows if actual in flow.publishers]
+        if actual.observed is not None or actual.report is not None:
             for quantity in actual.planned.quantities:
-                yield from _unmeasured_at(view, actual, quantity, flows)
-    for flow in view.flows:
-        if is_missing(flow):
-            continue
-        for quantity in flow.planned.quantities:
-            why = _why_not(view, flow, quantity)
-            if why:
-                where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+                yield from _unmeasured_at(actual, quantity, of_end.get(id(actual), []))
+    for each in counted:
+        for quantity in each.flow.planned.quantities:
+            if why := each.why_not(quantity):
                 yield NOT_MEASURED.finding(
-                    subject=flow.subject,
+                    subject=each.flow.subject,
                     expected=str(quantity),
                     observed="not measured",
-                    message=f"{quantity} of {where} is not measured: {why}",
+                    message=f"{quantity} of {each.where} is not measured: {why}",
                     at=quantity.at,
-                    ends=flow.ends,
+                    ends=each.flow.ends,
                 )
-        yield from _judged(view, flow)
+        if _is_active(view, each.flow):
+            yield from _judged(view, each)
 
 
 def measurements(view: View) -> tuple[FlowMeasurement, ...]:
     """Return what has arrived of every flow that is counted, in plan order."""
     found = []
-    for flow in view.flows:
-        sample = None if is_missing(flow) else _sample(view, flow)
+    for each in _counted(view):
+        flow, sample = each.flow, each.sample
         if sample is None or not _is_active(view, flow):
             continue
         past = sample.last(seconds=DELAY_S)
@@ -161,13 +231,13 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 publisher=flow.publisher,
                 subscription=flow.subscription,
                 messages=past.messages,
-                lost=None if sample.lost is None or _publishers(view, flow) > 1 else past.lost,
+                lost=None if sample.lost is None or each.several > 1 else past.lost,
                 rate_hz=past.rate_hz,
                 p50_ms=sample.used.quantile_ms(0.5) if clocks else None,
                 p99_ms=sample.used.quantile_ms(0.99) if clocks else None,
                 bounds=tuple(
                     _bound(quantity, bound, judgement)
-                    for quantity, bound, judgement in _judgements(view, flow, sample)
+                    for quantity, bound, judgement in each.judgements(view)
                 ),
             )
         )
@@ -187,93 +257,82 @@ def _bound(quantity: Quantity, bound: Bound, judgement: Judgement) -> MeasuredBo
     )
 
 
-def _judged(view: View, flow: FlowView) -> Iterator[Finding]:
-    sample = _sample(view, flow)
-    if sample is None or not _is_active(view, flow):
-        return
-    where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-    for quantity, bound, judgement in _judgements(view, flow, sample):
-        observed = f"{judgement.observed} {judgement.allowed}"
+def _judged(view: View, each: _Counted) -> Iterator[Finding]:
+    for quantity, bound, judgement in each.judgements(view):
+        sample = each.sample
+        assert sample is not None
         if judgement.kept is False:
             yield _RULES[bound.kind].finding(
-                subject=flow.subject,
+                subject=each.flow.subject,
                 expected=str(quantity),
                 observed=judgement.observed,
-                message=f"{where}: {observed}",
+                message=f"{each.where}: {judgement.observed} {judgement.allowed}",
                 at=quantity.at,
-                ends=flow.ends,
+                ends=each.flow.ends,
             )
         elif judgement.kept is None and not sample.messages and sample.seconds > PROBATION_S:
             yield SILENT_SO_FAR.finding(
-                subject=flow.subject,
+                subject=each.flow.subject,
                 expected=str(quantity),
                 observed="no message",
-                message=f"{quantity} of {where} is not measured: nothing has arrived for"
+                message=f"{quantity} of {each.where} is not measured: nothing has arrived for"
                 f" {sample.silent_s:.0f} s",
                 at=quantity.at,
-                ends=flow.ends,
+                ends=each.flow.ends,
             )
 
 
-def _judgements(
-    view: View, flow: FlowView, sample: Sample
-) -> Iterator[tuple[Quantity, Bound, Judgement]]:
-    """Judge each number of a flow that can be measured, the same one only once."""
-    publisher = flow.nodes[0].configuration
-    counts = publisher is not None and publisher.measured is not None
-    near = brings_up(flow.nodes[0].node, view.machines)
-    publishes_s = publisher.measured.active_s if counts and near else None  # type: ignore[union-attr]
-    seen: set[Bound] = set()
-    ends = (each for end in flow.publishers for each in end.planned.quantities)
-    for quantity in (*flow.planned.quantities, *ends):
-        if _why_not(view, flow, quantity):
-            continue
-        for bound in bounds_of(quantity):
-            if bound not in seen and not (bound.kind is Kind.LOSS and sample.lost is None):
-                seen.add(bound)
-                yield quantity, bound, judge(bound, sample, publishes_s=publishes_s)
-
-
 def _unmeasured_at(
-    view: View, actual: Actual, quantity: Quantity, flows: list[FlowView]
+    actual: Actual, quantity: Quantity, flows: Sequence[_Counted]
 ) -> Iterator[Finding]:
-    """Name a number of a publisher that is not measured at each of its subscriptions."""
-    reasons = [_why_not(view, flow, quantity) for flow in flows if not is_missing(flow)]
-    if not flows:
-        reasons = ["nothing in the manifest subscribes to it"]
+    """Name a number of an endpoint that is not measured in its flows.
+
+    How often something is published shows wherever it arrives; the rest is another thing in each
+    flow.
+    """
+    noun, topic = actual.planned.kind.noun, actual.planned.resolved
+    reasons = [each.why_not(quantity) for each in flows]
+    anywhere = {each.kind for each in bounds_of(quantity)} <= {Kind.RATE, Kind.SILENCE}
     why = next(filter(None, reasons), "")
-    if not why:
-        return
-    where = f"the publisher of {actual.planned.resolved} in {actual.node.full_name}"
-    yield NOT_MEASURED.finding(
-        subject=actual.planned.resolved,
-        expected=str(quantity),
-        observed="not measured",
-        message=f"{quantity} of {where} is not measured: {why}",
-        at=quantity.at,
-        node=actual.node.full_name,
-        endpoint=actual.planned.kind,
-    )
+    if not flows:
+        verb = "subscribes to" if actual.planned.kind is EndpointKind.PUBLISHER else "publishes"
+        why = f"nothing that is there and declared {verb} it"
+    if why and not (anywhere and "" in reasons):
+        yield NOT_MEASURED.finding(
+            subject=topic,
+            expected=str(quantity),
+            observed="not measured",
+            message=f"{quantity} of the {noun} of {topic} in {actual.node.full_name} is not"
+            f" measured: {why}",
+            at=quantity.at,
+            node=actual.node.full_name,
+            endpoint=actual.planned.kind,
+        )
 
 
-def _why_not(view: View, flow: FlowView, quantity: Quantity) -> str:
-    """Return why a number of a flow cannot be measured; empty if it can."""
-    bounds = bounds_of(quantity)
-    kinds = {each.kind for each in bounds}
-    subscriber = flow.nodes[1]
-    if not bounds:
-        return "nothing measures it"
-    if not subscriber.is_ours:
-        return f"{flow.subscription} does not run in our host"
-    if kinds & {Kind.DELAY, Kind.NETWORK_DELAY} and _differ(flow):
-        return "the clocks of the two hosts are not compared"
-    several = _publishers(view, flow)
-    if several > 1 and kinds - {Kind.DELAY, Kind.NETWORK_DELAY}:
-        return f"nothing shows which of the {several} publishers of the topic a message is from"
-    sample = _sample(view, flow)
-    if Kind.LOSS in kinds and sample is not None and sample.lost is None:
-        return "its RMW gives messages no publication sequence numbers"
-    return ""
+def _counted(view: View) -> list[_Counted]:
+    planned: Counter[tuple[str, str]] = Counter()
+    for flow in view.flows:
+        planned[flow.planned.topic, flow.subscription] += len(flow.publishers) or 1
+    found, topics = [], set()
+    for flow in view.flows:
+        if is_missing(flow):
+            continue
+        end = (flow.planned.topic, flow.subscription)
+        matched = [each.report.matched or 0 for each in flow.subscriptions if each.report]
+        published = (each for one in flow.publishers for each in one.planned.quantities)
+        of_topic = (each for one in flow.subscriptions for each in one.planned.quantities)
+        found.append(
+            _Counted(
+                flow=flow,
+                sample=_sample(view, flow),
+                several=max(planned[end], *matched, 1),
+                own=(*flow.planned.quantities, *published),
+                of_topic=() if end in topics else tuple(of_topic),  # once, whoever publishes
+            )
+        )
+        topics.add(end)
+    return found
 
 
 def _differ(flow: FlowView) -> bool:
@@ -282,17 +341,6 @@ def _differ(flow: FlowView) -> bool:
     if len(hosts) < len(flow.nodes):
         hosts = [each.node.machine for each in flow.nodes]
     return len({*hosts}) > 1
-
-
-def _publishers(view: View, flow: FlowView) -> int:
-    """Return how many publishers a subscription of the flow has, planned or matched."""
-    planned = sum(
-        len(each.publishers) or 1
-        for each in view.flows
-        if (each.planned.topic, each.subscription) == (flow.planned.topic, flow.subscription)
-    )
-    matched = [each.report.matched or 0 for each in flow.subscriptions if each.report is not None]
-    return max((planned, *matched))
 
 
 def _sample(view: View, flow: FlowView) -> Sample | None:
@@ -315,7 +363,3 @@ def _is_active(view: View, flow: FlowView) -> bool:
         and (facts.configuration is None or facts.configuration.state in ("", "active"))
         for facts in flow.nodes
     )
-
-
-def _is_there(actual: Actual) -> bool:
-    return actual.observed is not None or actual.report is not None

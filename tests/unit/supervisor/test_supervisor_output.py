@@ -300,7 +300,7 @@ def test_the_live_table_shows_each_node_and_scrolls_what_it_prints() -> None:
         live.finish(RESULT)
     shown = stream.getvalue()
     assert "[camera] shutter is open" in shown
-    assert "connecting ▸ verifying ▸ activating ▸ active" in shown
+    assert "connecting ▸ verifying ▸ activating ▸ measuring ▸ active" in shown
     row = next(line for line in shown.splitlines() if line.strip().startswith("/camera "))
     assert row.split() == ["/camera", "running", "7", "active", "1/2", "1/3"]
     assert "verdict: ok" in shown

@@ -10,7 +10,6 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Health,
     Policy,
-    Quantity,
     Run,
     RunKind,
 )
@@ -31,7 +30,6 @@ from tests.builders import (
     IMAGE,
     at,
     endpoint,
-    link,
     need,
     nfe,
     node,
@@ -637,28 +635,6 @@ def test_a_written_depth_needs_keep_last_and_is_one_finding_for_all_endpoints_of
         "/a (publisher): history KEEP_LAST, depth 10; /b (publisher): history KEEP_LAST, depth 10"
     )
     assert finding.at == "robot.lifecycle.yaml:4:9"
-
-
-# --- numbers that nobody measures
-
-
-def test_each_declared_number_is_unverifiable_by_name_at_its_place():
-    numbers = (
-        Quantity(name="max_delay_ms", value=0.0001, at=at(21, 40)),
-        Quantity(name="rate_hz", value=500, at=at(22, 11)),
-    )
-    plan = planned(
-        node("one", publisher("a"), needs=[need(PUB, "a", quantities=numbers)]),
-        node("two", subscription("a")),
-        links=[link("/a", "one", "two", quantities=numbers[:1])],
-    )
-    verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
-    assert [(each.outcome, each.expected, each.at) for each in verdict.findings] == [
-        (Outcome.UNVERIFIABLE, "max_delay_ms 0.0001", "robot.lifecycle.yaml:21:40"),
-        (Outcome.UNVERIFIABLE, "rate_hz 500", "robot.lifecycle.yaml:22:11"),
-        (Outcome.UNVERIFIABLE, "max_delay_ms 0.0001", "robot.lifecycle.yaml:21:40"),
-    ]
-    assert verdict.flows[0].outcome is Outcome.OK, "what it is, is proven; what it does, is not"
 
 
 # --- definitions of types

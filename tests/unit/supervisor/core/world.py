@@ -19,20 +19,23 @@ from lifecycle.manifest.model import (
     BY_DEFAULT,
     Condition,
     Consequence,
+    EndpointKind,
     Mode,
     OnFailure,
+    Quantity,
     Reaction,
     Restart,
     RunKind,
     Supervision,
     TargetState,
 )
+from lifecycle.measure.bounds import Kind
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.outcome import FlowMeasurement, MeasuredBound, Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Finding, Verdict
-from tests.builders import HERE, plan_of, planned_node
+from tests.builders import HERE, plan_of, planned_endpoint, planned_node
 
 STEPS = 6_000
 """No story takes more."""
@@ -68,6 +71,23 @@ def verdict(*found: tuple[str, str]) -> Verdict:
     return Verdict(verdict=outcome, blocking=bool(findings), findings=findings, flows=())
 
 
+def measured(outcome: str, r: random.Random) -> FlowMeasurement:
+    """What is measured of a flow of which one number is declared."""
+    left_s = r.choice([None, 0.5, 30.0]) if outcome == "measuring" else None
+    bound = MeasuredBound(
+        name="rate_hz", kind=Kind.RATE, outcome=outcome, text="9.0 Hz", decides_in_s=left_s
+    )
+    return FlowMeasurement(
+        topic="/data",
+        publisher="/n0",
+        subscription="/n1",
+        messages=r.randint(0, 99),
+        lost=0,
+        rate_hz=9.0,
+        bounds=(bound,),
+    )
+
+
 def random_plan(r: random.Random) -> Plan:
     """A system of up to six nodes in processes of their own or together, with an order."""
     nodes: list[PlannedNode] = []
@@ -100,6 +120,10 @@ def random_plan(r: random.Random) -> Plan:
             loaded = {"component": "p/C", "container": r.choice(hosts).key}
             node = replace(node, run=replace(node.run, **loaded))
         nodes.append(node)
+    if r.random() < 0.4:
+        rate = (Quantity(name="rate_hz", value=9, at=HERE),)
+        published = planned_endpoint(EndpointKind.PUBLISHER, "data", quantities=rate)
+        nodes[-1] = replace(nodes[-1], endpoints=(published,))
     # Nodes of one process cannot wait for each other to start.
     plan = plan_of(*map(_startable(nodes), nodes))
     what = r.choice([*Consequence][:4])
@@ -146,6 +170,7 @@ class World:
         self.now_s = 0.0
         self.wake_s = float("inf")
         self.intruder_s: float | None = None
+        self.data = "ok"  # what is measured of data, while they flow
         self.wrong = ""  # full name of a node that has other parameters than declared
         self.mark = 0  # what changed until now
         self.looks: dict[int, int] = {}  # and until looks began, by the mark that they have
@@ -166,6 +191,7 @@ class World:
             hold_s=r.choice([None, 5.0]),
             timeout_s=30.0,
             keep_going=r.random() < 0.2,
+            strict=r.random() < 0.2,
         )
         self.run = core.state.new_run(self.plan, options)
         self.give(core.inputs.Tick())
@@ -344,7 +370,13 @@ class World:
         wrong = held and self.intruder_s is not None
         self.seen_s = (self.now_s if self.seen_s is None else self.seen_s) if wrong else None
         self.see_how_long()
-        return verdict(*found)
+        run = self.run
+        flows = run.held_s is not None and run.passage is None and bool(run.plan.bounds)
+        if not flows or self.core.advance.stage_of(run).value != "active":
+            return verdict(*found)
+        if self.data == "violated":
+            found.append(("flow.rate", run.plan.nodes[-1].full_name))
+        return replace(verdict(*found), measured=(measured(self.data, self.r),))
 
     # What breaks, and who orders what
 
@@ -366,6 +398,9 @@ class World:
             self.see(1.5)
             self.intruder_s = None
             self.give(inputs.Changed())
+        elif what == "data":
+            self.data = r.choice(["ok", "measuring", "violated"])
+            self.see(0.7)
         elif what == "differ":
             self.wrong = "" if self.wrong else r.choice(self.plan.nodes).full_name
             self.see(0.7)
@@ -434,7 +469,7 @@ class World:
     def settle_down(self) -> None:
         """From now on nothing breaks, and what is wrong is over."""
         self.calm = True
-        self.intruder_s, self.wrong = None, ""
+        self.intruder_s, self.wrong, self.data = None, "", "ok"
         for key in self.run.nodes:
             self.give(self.core.inputs.Silent(node=key))
         self.give(self.core.inputs.Changed())
@@ -514,6 +549,8 @@ class World:
             assert level < 4 or not down or node.guarded > 5, (
                 f"withheld: {node.key} stays active {self}"
             )
+        probation = self.core.advance.phase_of(self.run) == "measuring"
+        assert not probation or self.now_s <= self.run.held_s + 10, "ends: measures for ever"
         assert not self.run.orders, "answers: an order waits for ever"
         assert self.run.order is None, f"answers: an order is never done {self}"
 
@@ -563,5 +600,5 @@ class World:
         )
 
 
-_FAULTS = ("intrude", "retreat", "linger", "differ", "hang", "activate", "wait")
+_FAULTS = ("intrude", "retreat", "linger", "data", "differ", "hang", "activate", "wait")
 _ORDERS = ("pause", "resume", "restart", "mode", "apply")

@@ -1,0 +1,156 @@
+"""What is declared of data is measured where they arrive, and judged; real DDS, real processes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lifecycle.errors import ExitCode
+from tests.ros.supervisor.running import LIMITS, up, verb, write
+
+pytestmark = pytest.mark.ros
+
+NODES = "tests.ros.measure.nodes"
+BOUNDS = {"max_delay_ms": 20, "quantile": 0.9, "rate_hz": 80, "loss": 0.05, "max_silence_s": 1}
+QOS = {"reliability": "BEST_EFFORT", "depth": 5}
+SUBJECT = "/numbers: /source → /sink"
+SEEN_S = 8.0
+"""A violation is found within 2 s, or once the sample decides, on a machine with time for it."""
+
+
+def system(
+    directory: Path, domain_id: int, *, sink: Mapping[str, Any] = {}, **keys: Any
+) -> tuple[Path, Path]:
+    """Write a system and the file of its fault; return both paths."""
+    fault = directory / "fault"
+    fault.write_text("")
+    numbers = [{"name": "numbers", "type": "std_msgs/msg/UInt64", "qos": QOS}]
+    nodes = {
+        "source": {
+            "run": {"python": f"{NODES}:Source", "environment": {"FAULT": str(fault)}},
+            "timeouts": LIMITS,
+            "interface": {"publishers": numbers},
+        },
+        "sink": {
+            "run": {"python": f"{NODES}:Sink", "environment": {"FAULT": str(fault)}},
+            "timeouts": LIMITS,
+            "interface": {"subscriptions": numbers},
+            **sink,
+        },
+    }
+    links = [{"topic": "/numbers", "from": "source", "to": "sink", **keys.pop("bounds", BOUNDS)}]
+    return write(directory, domain_id, nodes, links=links, **keys), fault
+
+
+def bounds_of(verdict: Mapping[str, Any]) -> dict[str, str]:
+    flows = verdict.get("measured", ())
+    return {each["name"]: each["outcome"] for flow in flows for each in flow["bounds"]}
+
+
+PLAIN = {"run": {"python": f"{NODES}:PlainSink"}, "managed": False}
+
+
+@pytest.mark.parametrize("sink", ["ours", "plain"])
+def test_numbers_that_are_kept_are_ok_once_they_are_decided(
+    tmp_path: Path, fresh_domain: int, sink: str
+) -> None:
+    plain = {**PLAIN, "run": {**PLAIN["run"], "environment": {"FAULT": str(tmp_path / "fault")}}}
+    manifest, _ = system(tmp_path, fresh_domain, sink=plain if sink == "plain" else {})
+    with up(manifest, "--stop-after", "0.5", "--strict", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.OK, run.events[-5:]
+        assert bounds_of(run.verdict) == dict.fromkeys(
+            ("max_delay_ms", "rate_hz", "loss", "max_silence_s"), "ok"
+        )
+        (flow,) = run.verdict["measured"]
+        assert flow["rate_hz"] == pytest.approx(100, rel=0.2)
+        assert 0 < flow["p50_ms"] <= flow["p99_ms"]
+        line = "measured: /numbers /source → /sink: delay p90"
+        assert any(each["message"].startswith(line) for each in run.of_kind("notice"))
+        run.assert_gate_held()
+
+
+def test_each_fault_of_a_running_system_is_found_and_each_recovery(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest, fault = system(tmp_path, fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.until_verdict(lambda verdict: set(bounds_of(verdict).values()) == {"ok"})
+        for wrong, rule in (
+            ("busy", "flow.delay"),
+            ("slow", "flow.rate"),
+            ("lossy", "flow.loss"),
+            ("silent", "flow.silent"),
+        ):
+            since, begun_s = len(run.events), time.monotonic()
+            fault.write_text(wrong)
+            run.until_found(rule, SUBJECT, since=since)
+            found_s = time.monotonic() - begun_s
+            assert found_s < SEEN_S, (wrong, found_s)
+            since = len(run.events)
+            fault.write_text("")
+            run.until_verdict(lambda verdict: verdict["verdict"] == "ok", since=since)
+        run.process.terminate()
+        assert run.finish() == ExitCode.OK
+
+
+def test_a_violated_number_takes_a_strict_system_back_to_inactive(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest, fault = system(tmp_path, fresh_domain)
+    fault.write_text("slow")
+    with up(manifest, "--strict", "--stop-after", "1", runtime=tmp_path) as run:
+        taken = run.until("consequence")
+        assert (taken["action"], taken["rule"], taken["subject"]) == ("pause", "flow.rate", SUBJECT)
+        for node in ("/source", "/sink"):
+            run.met("node", node=node, state="inactive")
+        assert run.finish() == ExitCode.VIOLATED
+
+
+def test_what_is_to_be_done_about_a_violated_number_is_done(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest, fault = system(tmp_path, fresh_domain, on_violation={"flow.silent": "stop"})
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        fault.write_text("silent")
+        assert run.finish() == ExitCode.VIOLATED
+        (finding,) = run.verdict["findings"]
+        assert (finding["rule"], finding["subject"]) == ("flow.silent", SUBJECT)
+
+
+def test_verify_measures_what_runs_already(tmp_path: Path, fresh_domain: int) -> None:
+    manifest, fault = system(tmp_path, fresh_domain)
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        judged = verb("verify", str(manifest), "--timeout", "15", runtime=tmp_path)
+        assert judged.returncode == ExitCode.OK, judged.stdout
+        assert "/numbers /source → /sink: delay p90" in judged.stdout
+        fault.write_text("slow")
+        run.until_found("flow.rate", SUBJECT)
+        judged = verb("verify", str(manifest), "--timeout", "1", runtime=tmp_path)
+        assert judged.returncode == ExitCode.VIOLATED
+        assert "flow.rate" in judged.stdout
+
+
+def test_what_a_node_of_others_takes_is_unverifiable_and_strict_refuses_it(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    program = "from tests.ros.measure import nodes; nodes.main()"
+    own = {
+        "run": {
+            "command": [sys.executable, "-c", program],
+            "environment": {"FAULT": str(tmp_path / "fault")},
+        },
+        "managed": False,
+    }
+    manifest, _ = system(tmp_path, fresh_domain, sink=own)
+    with up(manifest, "--strict", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.UNVERIFIABLE
+        named = {each["expected"] for each in run.verdict["findings"]}
+        assert {"max_delay_ms 20 for 0.9", "rate_hz 80", "loss 0.05", "max_silence_s 1"} <= named

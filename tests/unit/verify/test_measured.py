@@ -1,0 +1,188 @@
+"""What is judged of data that have arrived, and what is named because nothing measures it."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from lifecycle.manifest.model import EndpointKind, Quantity, Run, RunKind
+from lifecycle.measure.delays import Delays, bucket_of
+from lifecycle.measure.sample import Measured, Sample, Slot
+from lifecycle.plan.model import Plan
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage, Verdict
+from tests.builders import at, link, need, node, planned, publisher, subscription
+from tests.unit.verify.edits import change_configuration, change_report
+from tests.unit.verify.lines import verify
+from tests.unit.verify.perfect import perfect
+
+PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
+FOREIGN = Run(kind=RunKind.COMMAND, command=("other",))
+
+
+def number(name: str, value: float, line: int = 22, **rest: float) -> Quantity:
+    return Quantity(name=name, value=value, at=at(line), **rest)
+
+
+def pair(*of_link: Quantity, run: Run | None = None, **ends: tuple[Quantity, ...]) -> Plan:
+    """One publishing and one subscribing node, with numbers of the link and of the two ends."""
+    needs = {
+        kind: [need(kind, "a", quantities=ends[word])] if word in ends else []
+        for kind, word in ((PUB, "published"), (SUB, "subscribed"))
+    }
+    how = {} if run is None else {"run": run}
+    return planned(
+        node("one", publisher("a"), needs=needs[PUB]),
+        node("two", subscription("a"), needs=needs[SUB], **how),
+        links=[link("/a", "one", "two", quantities=of_link)],
+    )
+
+
+def arrived(
+    messages: int, seconds: float, *, delay_ms: float = 1.0, lost: int = 0, silent_s: float = 0.0
+) -> Sample:
+    histogram = {bucket_of(round(delay_ms * 1e6)): messages} if messages else {}
+    delays = Delays.of((histogram,), seconds=min(seconds, 5.0))
+    slot = Slot(seconds=seconds, messages=messages, lost=lost)
+    return Sample(
+        seconds=seconds,
+        silent_s=silent_s,
+        messages=messages,
+        lost=lost,
+        slots=(slot,),
+        used=delays,
+        received=delays,
+    )
+
+
+def judged(plan: Plan, sample: Sample | None, stage: Stage = Stage.ACTIVE) -> Verdict:
+    seen: Observation = perfect(plan, stage)
+    if sample is not None:
+        counted = Measured(active_s=sample.seconds, samples=(("/a", sample),))
+        seen = change_configuration("/two", measured=counted)(seen)
+        seen = change_configuration("/one", measured=Measured(active_s=sample.seconds + 2))(seen)
+    return verify(plan, seen, stage=stage)
+
+
+def of_data(verdict: Verdict) -> list[Finding]:
+    rules = ("delay", "rate", "loss", "silent", "not-measured", "nothing-arrived")
+    return [each for each in verdict.findings if each.rule in {f"flow.{word}" for word in rules}]
+
+
+@pytest.mark.parametrize(
+    ("quantity", "kept", "broken", "rule"),
+    [
+        (number("max_delay_ms", 5), arrived(300, 10), arrived(300, 10, delay_ms=8), "flow.delay"),
+        (number("rate_hz", 15, slack=0.05), arrived(145, 10), arrived(135, 10), "flow.rate"),
+        (number("rate_hz", 0, most=20), arrived(190, 10), arrived(220, 10), "flow.rate"),
+        (number("rate_hz", 15, most=20), arrived(180, 10), arrived(130, 10), "flow.rate"),
+        (number("loss", 0.01), arrived(2000, 20, lost=2), arrived(1950, 20, lost=50), "flow.loss"),
+        (number("max_silence_s", 2), arrived(9, 10), arrived(9, 10, silent_s=2.5), "flow.silent"),
+        (number("five_qi", 85), arrived(300, 10), arrived(300, 10, delay_ms=8), "flow.delay"),
+    ],
+    ids=lambda each: str(each) if isinstance(each, Quantity) else None,
+)
+@pytest.mark.parametrize("where", ["link", "published", "subscribed"])
+def test_a_declared_number_is_ok_or_violated_with_numbers_wherever_it_is_declared(
+    quantity: Quantity, kept: Sample, broken: Sample, rule: str, where: str
+) -> None:
+    plan = pair(quantity) if where == "link" else pair(**{where: (quantity,)})
+    good = judged(plan, kept)
+    assert good.verdict is Outcome.OK
+    assert {each.outcome for each in good.measured[0].bounds} <= {"ok", "measuring"}
+    bad = judged(plan, broken)
+    assert bad.verdict is Outcome.VIOLATED
+    assert [(each.rule, each.subject) for each in of_data(bad)] == [(rule, "/a: /one → /two")]
+    assert of_data(bad)[0].expected == str(quantity)
+    assert of_data(bad)[0].at == "robot.lifecycle.yaml:22:1"
+
+
+def test_a_violated_delay_is_said_with_quantile_value_and_bound() -> None:
+    plan = pair(number("max_delay_ms", 5, quantile=0.9))
+    found = of_data(judged(plan, arrived(300, 10, delay_ms=8)))[0]
+    assert found.message == "the flow /one → /two on /a: delay p90 8 ms > 5 ms"
+    assert found.expected == "max_delay_ms 5 for 0.9"
+
+
+def test_what_cannot_be_decided_yet_is_shown_and_counts_for_nothing() -> None:
+    verdict = judged(pair(number("max_delay_ms", 5)), arrived(20, 1, delay_ms=8))
+    assert verdict.verdict is Outcome.OK
+    bound = verdict.measured[0].bounds[0]
+    assert (bound.outcome, bound.text) == ("measuring", "delay p99 8 ms, measuring ≤ 5 ms")
+    assert bound.decides_in_s == pytest.approx(4.0)
+
+
+def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> None:
+    verdict = judged(pair(number("max_delay_ms", 5)), None, Stage.CONNECTED)
+    assert (verdict.verdict, verdict.measured) == (Outcome.OK, ())
+
+
+def test_a_number_of_which_nothing_arrives_is_unverifiable_after_the_probation() -> None:
+    plan = pair(number("max_delay_ms", 5))
+    assert judged(plan, arrived(0, 9, silent_s=9)).verdict is Outcome.OK
+    found = of_data(judged(plan, arrived(0, 11, silent_s=11)))
+    assert [(each.rule, each.outcome) for each in found] == [
+        ("flow.nothing-arrived", Outcome.UNVERIFIABLE)
+    ]
+
+
+@pytest.mark.parametrize("stage", Stage)
+@pytest.mark.parametrize("where", ["link", "published", "subscribed"])
+def test_a_number_of_a_subscription_that_is_not_ours_is_unverifiable_by_name(
+    stage: Stage, where: str
+) -> None:
+    numbers = (number("max_delay_ms", 0.0001), number("rate_hz", 500, slack=0.05))
+    plan = pair(*numbers, run=FOREIGN) if where == "link" else pair(run=FOREIGN, **{where: numbers})
+    found = of_data(judged(plan, None, stage))
+    assert [(each.outcome, each.expected, each.at) for each in found] == [
+        (Outcome.UNVERIFIABLE, "max_delay_ms 0.0001", "robot.lifecycle.yaml:22:1"),
+        (Outcome.UNVERIFIABLE, "rate_hz 500", "robot.lifecycle.yaml:22:1"),
+    ]
+    assert "/two does not run in our host" in found[0].message
+
+
+@pytest.mark.parametrize(
+    ("quantity", "why"),
+    [
+        (number("max_message_size", 1500), "a callback does not show the size of a message"),
+        (number("five_qi", 200), "128 to 254 are an operator's own classes"),
+    ],
+)
+def test_a_number_that_nothing_can_measure_says_why(quantity: Quantity, why: str) -> None:
+    found = of_data(judged(pair(published=(quantity,)), arrived(300, 10)))
+    assert [each.message for each in found] == [
+        f"{quantity} of the publisher of /a in /one is not measured: {why}"
+    ]
+
+
+def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
+    rate, loss = number("rate_hz", 15, slack=0.05), number("loss", 0.01)
+    topic_rate = number("rate_hz", 15, 30, slack=0.05)
+    plan = pair(rate, subscribed=(topic_rate, loss, number("max_delay_ms", 5)))
+    sample = arrived(300, 10)
+    seen = change_report(SUB, "/a", matched=2)(perfect(plan, Stage.ACTIVE))
+    counted = Measured(active_s=10, samples=(("/a", sample),))
+    verdict = verify(plan, change_configuration("/two", measured=counted)(seen), stage=Stage.ACTIVE)
+    named = [(each.subject, each.expected) for each in of_data(verdict)]
+    assert named == [("/a", "loss 0.01"), ("/a: /one → /two", "rate_hz 15")]
+    assert [each.name for each in verdict.measured[0].bounds] == ["rate_hz", "max_delay_ms"]
+    assert verdict.measured[0].lost is None
+
+
+def test_a_rate_of_a_publisher_is_proven_at_one_subscription_and_its_delay_at_each() -> None:
+    numbers = (number("rate_hz", 15, slack=0.05), number("max_delay_ms", 5))
+    plan = planned(
+        node("one", publisher("a"), needs=[need(PUB, "a", quantities=numbers)]),
+        node("two", subscription("a")),
+        node("three", subscription("a"), run=FOREIGN),
+    )
+    found = of_data(judged(plan, arrived(300, 10)))
+    assert [(each.subject, each.expected) for each in found] == [("/a", "max_delay_ms 5")]
+
+
+def test_nothing_is_said_of_a_number_whose_endpoint_is_missing() -> None:
+    plan = pair(number("max_delay_ms", 5), run=FOREIGN)
+    seen = perfect(plan, Stage.ACTIVE)
+    gone = replace(seen, endpoints=tuple(each for each in seen.endpoints if each.kind is not SUB))
+    assert of_data(verify(plan, gone, stage=Stage.ACTIVE)) == []
