@@ -57,7 +57,7 @@ def columns(rows: Sequence[Sequence[str]], *, indent: int = 0, width: int = 0) -
     """Align the cells of rows in columns; the last cell of a row wraps under itself.
 
     Args:
-        rows: all of one length.
+        rows: all of one length; cells may be coloured.
         indent: spaces before each line.
         width: columns that a line should not pass, where words that are longer than what is left
             stay whole; 0 never wraps, so that each row is one line.
@@ -65,23 +65,29 @@ def columns(rows: Sequence[Sequence[str]], *, indent: int = 0, width: int = 0) -
     Returns:
         Lines without trailing blanks; columns that are empty in every row take no space.
     """
-    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sizes = [max(map(shown_length, column)) for column in zip(*rows, strict=True)]
     *fixed, last = [column for column, size in enumerate(sizes) if size] or [0]
     text: list[str] = []
     for row in rows:
-        first = " " * indent + "".join(row[each].ljust(sizes[each]) + _GAP for each in fixed)
+        cells = (row[each] + " " * (sizes[each] - shown_length(row[each])) + _GAP for each in fixed)
+        first = " " * indent + "".join(cells)
         if not width:
             text.append(first + row[last])
             continue
-        text += textwrap.wrap(
+        under = " " * shown_length(first)
+        wrapped = textwrap.wrap(
             row[last],
-            max(width, len(first) + _LEAST),
-            initial_indent=first,
-            subsequent_indent=" " * len(first),
+            max(width - len(under), _LEAST),
             break_long_words=False,
             break_on_hyphens=False,
-        ) or [first]
+        )
+        text += [first + "".join(wrapped[:1]), *(under + each for each in wrapped[1:])]
     return [line.rstrip() for line in text]
+
+
+def shown_length(text: str) -> int:
+    """Return how many characters of a text are shown: its colours are not."""
+    return len(_COLOUR.sub("", text))
 
 
 def _escaped(character: str) -> str:

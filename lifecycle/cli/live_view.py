@@ -20,6 +20,7 @@ from rich.text import Text
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
 from lifecycle.cli.verbs.control import HEADS, row
+from lifecycle.measure.flows import measured_summary
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
 from lifecycle.supervisor.run.events import (
@@ -39,6 +40,9 @@ from lifecycle.verify.report import render_text
 
 _REDRAW_S = 0.04
 """At most 25 times a second, however many events there are."""
+
+_AGAIN_S = 1.0
+"""And once a second without any: what is measured changes, and no event says so."""
 
 _AROUND_ROWS = 7
 """Of the table: the system, the columns' names and the lines around them, the verdict, and one row
@@ -88,6 +92,7 @@ class Live:
         if self._writer is not None:
             loop = asyncio.get_running_loop()
             self._writer.on_room = lambda: _soon(loop, self._catch_up)
+            loop.call_later(_AGAIN_S, self._draw_again, loop)
         self._draw()
 
     def __call__(self, event: Event) -> None:
@@ -133,6 +138,10 @@ class Live:
         if self._skipped or self._missed:
             self._draw()
 
+    def _draw_again(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._draw()
+        loop.call_later(_AGAIN_S, self._draw_again, loop)
+
     def _draw(self) -> None:
         self._skipped = self._is_behind
         if self._skipped:
@@ -149,12 +158,18 @@ class Live:
         for column in HEADS:
             # Where there is no room the others keep theirs; no row takes two lines.
             table.add_column(column, no_wrap=column not in ("node", ""))
-        shown = _that_fit(status.nodes, self._console.height - _AROUND_ROWS)
+        measured = measured_summary(status.measured)
+        rows = self._console.height - _AROUND_ROWS - bool(measured)
+        shown = _that_fit(status.nodes, rows)
         for node in shown:
             table.add_row(*_row(node))
         parts: list[RenderableType] = [_head(status), table]
         if left := len(status.nodes) - len(shown):
             parts.append(Text(f"… {left} more nodes: lifecycle status {status.system} --watch"))
+        if measured:
+            violated = any(each.violated for each in status.measured)
+            style = "red" if violated else "dim"
+            parts.append(Text(one_line(measured), style=style, overflow="ellipsis", no_wrap=True))
         style = "white" if status.verdict is None else _OUTCOMES[status.verdict]
         parts.append(Text(self._verdict, style=style, overflow="ellipsis", no_wrap=True))
         return Group(*parts)

@@ -40,7 +40,7 @@ class Watched:
         else:
             from rich.text import Text
 
-            shown = Text(self._last, no_wrap=True, overflow="crop")
+            shown = Text.from_ansi(self._last, no_wrap=True, overflow="crop")
             self._live.update(shown, refresh=True)
 
     def __enter__(self) -> Watched:  # noqa: PYI034 - typing.Self is not in Python 3.10

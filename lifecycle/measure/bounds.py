@@ -64,6 +64,7 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
         kept: None while the sample cannot decide.
         observed: `delay p99 0.6 ms`; empty while nothing is known.
         allowed: `≤ 5 ms`.
+        share: what was observed, divided by the bound; None while nothing is known.
         decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
             where that is not known.
         needs_clocks: the sample is large enough to decide, but too little is known of the clocks of
@@ -73,6 +74,7 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
     kept: bool | None
     observed: str
     allowed: str
+    share: float | None = None
     decides_in_s: float | None = None
     needs_clocks: bool = False
 
@@ -130,6 +132,9 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         kept=kept,
         observed=observed,
         allowed=_limit("≤", ">", kept, ms(bound.most)),
+        share=None
+        if found is None or clock is None
+        else max(0.0, found + clock.offset_ms) / bound.most,
         decides_in_s=decides_in_s,
         needs_clocks=needs_clocks,
     )
@@ -146,7 +151,9 @@ def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
     # Where a slot begins and ends makes a difference of one message.
     low = seen.messages + 1 < least * seen.seconds
     high = bound.most is not None and seen.messages - 1 > bound.most * seen.seconds
+    limit = slowest
     if bound.most is not None and (high or bound.least is None):
+        limit = bound.most
         allowed = _limit("≤", ">", not high, f"{bound.most:g} Hz")
     else:
         slack = f" - {bound.slack:.0%}" if bound.slack else ""
@@ -156,6 +163,7 @@ def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
         kept=not (low or high) if decided else None,
         observed=f"{seen.rate_hz:.1f} Hz" if seen.seconds else "",
         allowed=allowed,
+        share=seen.rate_hz / limit if seen.seconds else None,
         decides_in_s=None if decided else left_s,
     )
 
@@ -174,6 +182,7 @@ def _loss(bound: Bound, sample: Sample) -> Judgement:
         kept=kept,
         observed=lost(seen.lost, seen.published) if seen.published else "",
         allowed=_limit("≤", ">", kept, f"{bound.most:.6g}"),
+        share=seen.lost / seen.published / bound.most if seen.published else None,
         decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
     )
 
@@ -188,6 +197,7 @@ def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgeme
         kept=kept,
         observed=f"silent for {silent_s:.1f} s",
         allowed=_limit("≤", ">", kept, f"{bound.most:g} s"),
+        share=silent_s / bound.most,
         decides_in_s=max(0.0, bound.most - silent_s) if kept is None else None,
     )
 

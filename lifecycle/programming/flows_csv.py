@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from lifecycle.measure.flows import NUMBERS, FlowMeasurement, Pair
 from lifecycle.network.dscp import dscp_name, tos
 from lifecycle.verify.verdict import FlowReport
 
@@ -48,16 +49,19 @@ apply, is an empty cell.
 """
 
 
-def flows_to_csv(flows: Iterable[FlowReport]) -> str:
+def flows_to_csv(flows: Iterable[FlowReport], measured: Mapping[Pair, FlowMeasurement] = {}) -> str:
     """Return flow reports as CSV with a header line (RFC 4180, but lines end with a newline).
 
     A pair whose NFEs form several flows has one line each; a pair without any known IP flow (shared
-    memory, or NFEs that were not reported) has one line whose 5-tuple is empty.
+    memory, or NFEs that were not reported) has one line whose 5-tuple is empty. The last columns
+    are what has arrived of the pair, empty where that is not measured.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow((*COLUMNS, *NUMBERS))
     for report in flows:
+        found = measured.get(report.pair)
+        numbers = [None] * len(NUMBERS) if found is None else [*found.numbers().values()]
         for flow in report.tuples or (None,):
-            writer.writerow([cell(report, flow) for cell in COLUMNS.values()])
+            writer.writerow([*(cell(report, flow) for cell in COLUMNS.values()), *numbers])
     return text.getvalue()

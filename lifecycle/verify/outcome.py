@@ -1,7 +1,7 @@
-"""The three outcomes, and what a node reports of a connection: the words of a status.
+"""The three outcomes, and a node's connections: the words of a status.
 
-Owns: `Outcome`, `ConnectionReport`. Apart from verdicts and observations because `lifecycle status`
-shows them, which loads no plan, no manifest and no rule. Pure.
+Apart from verdicts and observations because `lifecycle status` shows them, which loads no plan, no
+manifest and no rule. Pure.
 """
 
 from __future__ import annotations

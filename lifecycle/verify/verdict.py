@@ -10,10 +10,9 @@ from typing import Annotated
 
 import msgspec
 
-from lifecycle.codec import Count, DscpValue, Octet, says
+from lifecycle.codec import DscpValue, Octet, says
 from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.measure.bounds import apart
-from lifecycle.measure.clock import ClockOffset
+from lifecycle.measure.flows import FlowMeasurement, Pair
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
 from lifecycle.verify.outcome import Outcome
@@ -115,65 +114,10 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "tuples", flow_tuples(self.source, self.destination))
 
-
-class MeasuredBound(msgspec.Struct, frozen=True, kw_only=True):
-    """A number that the manifest declares of a flow, and what was measured of it.
-
-    Attributes:
-        name: the manifest's key, `max_delay_ms`.
-        outcome: "measuring" while what has arrived cannot decide it; "unverifiable" where that is
-            because too little is known of the clocks of two hosts.
-        text: `delay p99 0.6 ms ≤ 5 ms`.
-        decides_in_s: about how long it takes yet to decide; None if it is decided, or where that is
-            not known.
-    """
-
-    name: str
-    outcome: Annotated[str, says(enum=["measuring", "ok", "violated", "unverifiable"])]
-    text: str
-    decides_in_s: float | None = None
-
-
-class FlowMeasurement(msgspec.Struct, frozen=True, kw_only=True):
-    """What has arrived of one publisher → subscription pair, at the subscription.
-
-    Attributes:
-        publisher: fully qualified node name.
-        subscription: fully qualified node name.
-        messages: how many arrived in the last 5 s or a little more.
-        lost: how many of those published meanwhile did not, by publication sequence numbers; None
-            where they do not show it.
-        rate_hz: messages per second of that time.
-        p50_ms: delay from publication to the start of the callback, milliseconds, of the last 200
-            messages or 5 s; None without a message, or between hosts whose clocks are not compared.
-        p99_ms: likewise.
-        clock: how far the clock of the publisher's host is ahead of the subscription's, which those
-            are corrected by; None on one host, or where it is not known.
-        bounds: what the manifest declares of it.
-    """
-
-    topic: str
-    publisher: str
-    subscription: str
-    messages: Count
-    lost: Count | None
-    rate_hz: float
-    p50_ms: float | None = None
-    p99_ms: float | None = None
-    clock: ClockOffset | None = None
-    bounds: tuple[MeasuredBound, ...] = ()
-
-    def describe(self) -> str:
-        """Return it in one line: `/video /camera → /viewer: delay p99 0.6 ms ≤ 5 ms, 15.0 Hz`."""
-        said = [each.text for each in self.bounds]
-        names = {each.name for each in self.bounds}
-        if "rate_hz" not in names:
-            said.append(f"{self.rate_hz:.1f} Hz")
-        if names.isdisjoint(("loss", "five_qi")) and self.lost is not None:
-            said.append(f"{self.lost} of {self.messages + self.lost} lost")
-        if self.clock is not None:
-            said.append(f"clocks {apart(self.clock)} apart")
-        return f"{self.topic} {self.publisher} → {self.subscription}: {', '.join(said)}"
+    @property
+    def pair(self) -> Pair:
+        """Topic, publisher and subscription."""
+        return self.topic, self.publisher, self.subscription
 
 
 class OpenEndpoint(msgspec.Struct, frozen=True, kw_only=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -50,3 +51,11 @@ def test_a_table_aligns_wraps_its_last_cell_and_drops_empty_columns():
         "  long  x",
     ]
     assert columns([]) == []
+
+
+@given(st.lists(st.lists(st.text("ab →", max_size=9), min_size=3, max_size=3), min_size=1))
+def test_coloured_cells_are_aligned_as_those_without_colours_are(rows):
+    coloured = [[f"\x1b[31m{first}\x1b[0m", second, last] for first, second, last in rows]
+    for width in (0, 30):
+        plain = [re.sub("\x1b\\[\\d+m", "", line) for line in columns(coloured, width=width)]
+        assert [line.rstrip() for line in plain] == columns(rows, width=width)

@@ -26,6 +26,7 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.measure.flows import measured_summary
 from lifecycle.printable import columns, count, json_text, lines, one_line
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
 
 
 def status_text(status: SystemStatus, *, width: int = 0) -> str:
-    """Return a status as lines: one for the system, one for each node and each connection.
+    """Return a status as lines: system, what was measured, and one for each node and connection.
 
     Args:
         status: of a system.
@@ -58,6 +59,8 @@ def status_text(status: SystemStatus, *, width: int = 0) -> str:
         f"up for {status.elapsed_s:.1f} s{applied}"
     )
     text = [one_line(head)]
+    if measured := measured_summary(status.measured):
+        text.append(one_line(measured))
     for line, node in zip(columns(rows), (None, *status.nodes), strict=True):
         text.append(line)
         text += [

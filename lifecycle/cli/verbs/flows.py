@@ -1,17 +1,23 @@
-"""`lifecycle flows`: show every network flow and how unique it is, export them, program networks.
+"""`lifecycle flows`: show every network flow, how unique it is and what was measured of it.
 
-Owns: flows as a table, JSON or CSV, `--export`, and the subcommands `apply`, `diff` and `remove`.
-Exported texts and what is done to networks are programming's.
+Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply`, `diff` and
+`remove`. Exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import shlex
+import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec.structs import asdict
 
 from lifecycle.cli.common import (
     NETWORKS,
@@ -30,14 +36,16 @@ from lifecycle.cli.common import (
     timeout_option,
     wrapped,
 )
+from lifecycle.cli.measured import Record, cells
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import UniqueHow
+from lifecycle.measure.flows import FlowMeasurement, measured_summary
 from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.printable import columns, json_text, lines, one_line
+from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
 from lifecycle.programming.flows_csv import flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
@@ -48,10 +56,13 @@ if TYPE_CHECKING:
     from lifecycle.programming.target import Chosen, TargetChanges
     from lifecycle.verify.verdict import Verdict
 
+_MEASURED = ("Hz", "p50 ms", "p99 ms", "lost")
+_NONE = ("",) * len(_MEASURED)
 _HEADS = (
     "topic",
     "publisher",
     "subscription",
+    *("rate_hz", "p50_ms", "p99_ms", "lost"),
     "source",
     "destination",
     "protocol",
@@ -67,46 +78,70 @@ _HEADS = (
 _UNIQUE = {UniqueHow.NOT: "no", UniqueHow.WEAKLY: "weakly", UniqueHow.STRONGLY: "strongly"}
 
 
-def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
+def render_flows(
+    flows: Sequence[FlowReport],
+    format_: str,
+    measured: Sequence[FlowMeasurement] = (),
+    *,
+    colour: bool = False,
+) -> str:
     """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
 
     In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
-    its `tuples`. `transport` is what carries it, not what could.
+    its `tuples`. `transport` is what carries it, not what could. In JSON `measured` is null where
+    nothing was.
     """
+    found = {each.pair: each for each in measured}
     if format_ == "json":
-        return json_text(to_json(tuple(flows)).decode())
+        documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
+        return json_text(to_json(documents).decode())
     if format_ == "csv":
-        return lines(flows_to_csv(flows).replace("\r\n", "\n").rstrip("\n"))
+        return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
     if not flows:
         return "no flow"
-    rows = [_HEADS, *(tuple(map(one_line, row)) for flow in flows for row in _rows(flow))]
-    return "\n".join(columns(rows))
+    rows = (row for each in flows for row in _rows(each, found.get(each.pair), colour=colour))
+    return "\n".join(columns([_HEADS, *rows]))
 
 
 def watched_flows(verdict: Verdict, format_: str) -> str:
     """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first."""
     width = terminal_width()
     if format_ != "text" or not width:
-        return render_flows(verdict.flows, format_)
+        return render_flows(verdict.flows, format_, verdict.measured)
     from lifecycle.cli.up_output import verdict_line
 
-    rows = [
-        (
-            flow.outcome.value,
-            one_line(flow.topic),
-            one_line(f"{flow.publisher} → {flow.subscription}"),
-            "unknown" if flow.unique is None else _UNIQUE[flow.unique],
-            "–" if flow.dscp is None else dscp_name(flow.dscp),
-            flow.effective_transport,
-        )
-        for flow in sorted(verdict.flows, key=lambda each: each.outcome is Outcome.OK)
-    ]
-    head = ("verdict", "topic", "flow", "unique", "dscp", "transport")
-    return "\n".join((wrapped([verdict_line(verdict)], width), *columns([head, *rows])))
+    found, names = {each.pair: each for each in verdict.measured}, _short_names(verdict.flows)
+    rows = [("verdict", *(_MEASURED if found else _NONE), "unique", "dscp", "transport", "flow")]
+    outcomes = [(_outcome(each, found.get(each.pair)), each) for each in verdict.flows]
+    for outcome, flow in sorted(outcomes, key=lambda each: each[0] is Outcome.OK):
+        numbers = cells(found.get(flow.pair), colour=True) if found else _NONE
+        unique = "unknown" if flow.unique is None else _UNIQUE[flow.unique]
+        dscp = "–" if flow.dscp is None else dscp_name(flow.dscp)
+        name = f"{flow.topic} {names[flow.publisher]} → {names[flow.subscription]}"
+        rest = (unique, dscp, flow.effective_transport, one_line(name))
+        rows.append((outcome.value, *numbers, *rest))
+    if max(map(shown_length, columns(rows))) > width:
+        rows = [(*row[:5], row[-1]) for row in rows]
+    head = filter(None, (verdict_line(verdict), measured_summary(verdict.measured)))
+    return "\n".join((wrapped(map(one_line, head), width), *columns(rows, width=width)))
 
 
-def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
-    pair = (flow.topic, flow.publisher, flow.subscription)
+def _short_names(flows: Sequence[FlowReport]) -> dict[str, str]:
+    """Return nodes' names without their namespaces, where no other node has the same."""
+    names = {name for flow in flows for name in (flow.publisher, flow.subscription)}
+    short = {name: name.rpartition("/")[2] for name in names}
+    taken = [*short.values()]
+    return {name: each if taken.count(each) == 1 else name for name, each in short.items()}
+
+
+def _outcome(flow: FlowReport, measured: FlowMeasurement | None) -> Outcome:
+    """Return how a flow is, with what has arrived of it."""
+    return Outcome.VIOLATED if measured is not None and measured.violated else flow.outcome
+
+
+def _rows(
+    flow: FlowReport, measured: FlowMeasurement | None, *, colour: bool
+) -> Iterator[tuple[str, ...]]:
     # What the data carry, and where that is known what the subscription acknowledges with.
     dscp = "–" if flow.dscp is None else describe(flow.dscp)
     dscp += "" if flow.reader_dscp is None else f"; back {describe(flow.reader_dscp)}"
@@ -118,10 +153,11 @@ def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
         " / ".join(each.value for each in flow.requirement),
         flow.demanded.value,
         flow.effective_transport,
-        flow.outcome.value,
+        _outcome(flow, measured).value,
     )
     for each in _tuples(flow):
-        yield (*pair, *each, *demands_and_verdict)
+        pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))
+        yield (*pair, *cells(measured, colour=colour), *rest)
 
 
 def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
@@ -184,8 +220,10 @@ def command() -> None:
 
     TARGET is a manifest, or the name of a system that a supervisor runs on this host.
 
-    One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
-    is, what was required and the verdict. Exits as `lifecycle verify` does.
+    One line per network flow: rate, delay and loss as far as they are measured, its 5-tuple, on
+    IPv6 its flow label, DSCP and TOS byte, how unique it is, what was required and the verdict.
+    Beside a number is how much of its declared bound it is; `!` is not kept, `?` not decided yet.
+    Exits as `lifecycle verify` does.
     """
 
 
@@ -194,6 +232,20 @@ def command() -> None:
 @assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
+@click.option(
+    "--record",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
+)
+@click.option(
+    "--for",
+    "for_s",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End --record after so long.",
+)
+@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @export_option
 def _show(
@@ -202,12 +254,19 @@ def _show(
     assignments: tuple[str, ...],
     format_: str,
     watch: bool,
+    record: Path | None,
+    for_s: float | None,
+    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
-    from lifecycle.supervisor.run.looking import follow_running, judge_running, supervisor_of
+    from lifecycle.supervisor.run.looking import judge_running, supervisor_of
 
+    if record is None and (force or for_s is not None):
+        raise UsageError("cannot use --for or --force without --record FILE")
+    if record is not None and (watch or export_ is not None):
+        raise UsageError("cannot use --record with --watch or --export; run each by itself")
     exported = None
     if export_ is not None:
         if watch:
@@ -221,10 +280,10 @@ def _show(
             hint="give --export, or use lifecycle flows apply",
         )
     plan = _plan_of(target, assignments)
+    if record is not None:
+        return _record(plan, Record(record, replaces=force), for_s)
     if watch:
-        with Watched(whole=format_ == "text") as shown:
-            follow_running(plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)))
-        return ExitCode.OK
+        return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
@@ -234,8 +293,80 @@ def _show(
     if exported is not None:
         export(seen.plan, seen.verdict.flows, *exported)
     else:
-        click.echo(render_flows(seen.verdict.flows, format_))
+        verdict, colour = seen.verdict, sys.stdout.isatty()
+        click.echo(render_flows(verdict.flows, format_, verdict.measured, colour=colour))
     return exit_code(seen.verdict, strict=False)
+
+
+def _measuring(plan: Plan) -> Path | None:
+    """Return the run of the supervisor on this host that measures a system; None without one."""
+    from lifecycle.supervisor.run.looking import supervisor_of
+
+    return supervisor_of(os.environ, plan, "") if plan.bounds else None
+
+
+def _watch(plan: Plan, format_: str) -> int:
+    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.run.looking import follow_running
+
+    path = _measuring(plan)
+    with Watched(whole=format_ == "text") as shown:
+        if path is None:
+            follow_running(
+                plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
+            )
+            return ExitCode.OK
+        with asking(path):
+            for seen in follow(path / "control"):
+                if seen.verdict is not None:
+                    shown.show(watched_flows(seen.verdict, format_))
+    click.echo(f"{path.name}: its supervisor has ended", err=True)
+    return ExitCode.OK
+
+
+_EACH_S = 1.0
+"""What is measured changes so often."""
+
+
+def _record(plan: Plan, record: Record, for_s: float | None) -> int:
+    """Write what is measured each second, until it is over or the supervisor ends."""
+    from lifecycle.supervisor.run.looking import follow_running
+
+    path = _measuring(plan)
+    with contextlib.closing(record):
+        try:
+            if path is not None:
+                _record_supervised(path, record, for_s)
+            else:
+                follow_running(
+                    plan,
+                    lambda seen: record.add(seen.verdict.measured),
+                    each_s=_EACH_S,
+                    for_s=for_s,
+                )
+        finally:
+            click.echo(f"{count(record.rows, 'row')} in {str(record.path)!r}", err=True)
+    return ExitCode.OK
+
+
+def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
+    from lifecycle.supervisor.control.client import status
+
+    began_s = time.monotonic()
+    for number in itertools.count():
+        if for_s is not None and number * _EACH_S >= for_s:
+            return
+        time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
+        try:
+            measured = status(path).measured
+        except TimeoutError:
+            continue  # it is busy; the next one may be answered
+        except UsageError:
+            if number == 0:
+                raise
+            click.echo(f"{path.name}: its supervisor has ended", err=True)
+            return
+        record.add(measured)
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:

@@ -16,6 +16,7 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
+from lifecycle.measure.flows import FlowMeasurement
 from lifecycle.run_directory import connect
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 
@@ -144,6 +145,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
         manifest: path of the manifest in force, as it was given; empty where it is not known.
         revision: number of it in this run; 1 for the one that it began with.
         ends: why it is being taken down; empty while it is not.
+        measured: what has arrived of each flow, where the manifest declares numbers of any.
     """
 
     system: str
@@ -158,6 +160,7 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     manifest: str = ""
     revision: int = 1
     ends: str = ""
+    measured: tuple[FlowMeasurement, ...] = ()
 
 
 class ControlRequest(enum.Enum):

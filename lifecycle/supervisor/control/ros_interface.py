@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
@@ -20,12 +21,13 @@ from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import supervisor_prefix, supervisor_services
+from lifecycle.measure.flows import FlowMeasurement, Pair
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
 from lifecycle.supervisor.core.state import Order
 from lifecycle.supervisor.run.events import Event, Notice, Stopping, SystemReached
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import supervisor_label, takes_diagnostics
-from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
@@ -81,7 +83,7 @@ class RosInterface:
         self._active = asyncio.Event()
         self._changed = asyncio.Event()
         self._ends = False
-        self._rules: set[str] = set()
+        self._reported = Reported()
         self._published: SystemStatus | None = None
 
     def on_event(self, event: Event) -> None:
@@ -143,7 +145,7 @@ class RosInterface:
         label = supervisor_label(status.system, self._machine)
         source = supervisor_prefix(status.system, self._machine)
         offer.publish_diagnostics(
-            diagnostics(status, seen.verdict, self._rules, label=label, source=source)
+            diagnostics(status, seen.verdict, self._reported, label=label, source=source)
         )
 
     def _called(self, name: str, answer: Answer) -> None:
@@ -166,6 +168,16 @@ class RosInterface:
             answer(not error, error or self._supervisor.status().phase)
 
 
+class Reported(msgspec.Struct):
+    """What had an entry on /diagnostics, and goes on having one.
+
+    An aggregator would take an entry that does not come any more for a failure.
+    """
+
+    flows: set[Pair] = msgspec.field(default_factory=set)
+    rules: set[str] = msgspec.field(default_factory=set)
+
+
 def _timeless(status: SystemStatus) -> SystemStatus:
     """Return a status without what changes with every second."""
     return replace(
@@ -186,16 +198,14 @@ def _timeless(status: SystemStatus) -> SystemStatus:
 
 
 def diagnostics(
-    status: SystemStatus, verdict: Verdict | None, reported: set[str], *, label: str, source: str
+    status: SystemStatus, verdict: Verdict | None, reported: Reported, *, label: str, source: str
 ) -> tuple[Entry, ...]:
-    """Return one entry for each node, and one for each rule that is violated or unverifiable.
+    """Return one entry for each node, each measured flow with declared numbers, each rule broken.
 
     Args:
         status: of the system.
         verdict: the last one; None before the first.
-        reported: rules that had an entry before. They go on having one, which says that all is
-            well: an aggregator would take an entry that does not come any more for a failure.
-            Those of `verdict` are added.
+        reported: what had an entry before; those of now are added.
         label: what the names of entries begin with, which an aggregator knows them by.
         source: their hardware id, by which those who read the health of nodes leave them out.
     """
@@ -213,8 +223,15 @@ def diagnostics(
         )
         for each in status.nodes
     ]
-    reported.update(each.rule for each in findings)
-    for rule in sorted(reported):
+    measured = {each.pair: each for each in status.measured if each.bounds}
+    reported.flows |= measured.keys()
+    entries += (
+        _of_flow(each, measured.get(each.pair), status, (label, source))
+        for each in (() if verdict is None else verdict.flows)
+        if each.pair in reported.flows
+    )
+    reported.rules.update(each.rule for each in findings)
+    for rule in sorted(reported.rules):
         found = [each for each in findings if each.rule == rule]
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         entries.append(
@@ -229,7 +246,26 @@ def diagnostics(
     return tuple(entries)
 
 
+_DONE = ("measuring", "active")
 _LEVELS = {Outcome.OK: OK, Outcome.UNVERIFIABLE: WARN, Outcome.VIOLATED: ERROR}
+
+
+def _of_flow(
+    flow: FlowReport,
+    measured: FlowMeasurement | None,
+    status: SystemStatus,
+    label: tuple[str, str],
+) -> Entry:
+    name = f"{label[0]}: {flow.topic} {flow.publisher} → {flow.subscription}"
+    if measured is None:
+        level, message = _LEVELS[flow.outcome], "not measured"
+        if level == OK and status.phase not in _DONE:
+            level, message = WARN, f"{message}, the system is {status.phase}"
+        return level, name, message, label[1], ()
+    level = ERROR if measured.violated else OK
+    message = ", ".join(each.text for each in measured.bounds)
+    bounds = ((each.name, each.text) for each in measured.bounds)
+    return level, name, message, label[1], (*measured.numbers().items(), *bounds)
 
 
 def _of_node(
@@ -243,7 +279,7 @@ def _of_node(
         level, message = ERROR, node.died
     elif node.silent:
         level, message = STALE, f"silent: {node.silent}"
-    elif level == OK and status.phase not in ("measuring", "active"):
+    elif level == OK and status.phase not in _DONE:
         level, message = WARN, f"{message}, the system is {status.phase}"
     values = [
         ("state", node.state),

@@ -165,4 +165,5 @@ def system_status(system: System) -> SystemStatus:
         manifest=run.first.manifest_path,
         revision=run.revision,
         ends="" if run.ending is None else run.ending.why,
+        measured=() if verdict is None else verdict.measured,
     )

@@ -41,7 +41,7 @@ from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.verify.judge import verify, with_findings
+from lifecycle.verify.judge import apart_from_numbers, verify, with_findings
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -129,32 +129,60 @@ def judge_running(
         return asyncio.run(judge(participant))
 
 
-def follow_running(plan: Plan, on_change: Callable[[JudgedSystem], None]) -> None:
+def follow_running(
+    plan: Plan,
+    on_change: Callable[[JudgedSystem], None],
+    *,
+    each_s: float | None = None,
+    for_s: float | None = None,
+) -> None:
     """Judge what runs whenever it changes, and give it to `on_change`, until interrupted.
 
     What may pass by itself is given a moment to do so, see `GracePeriod`.
+
+    Args:
+        plan: what should run.
+        on_change: takes what was seen.
+        each_s: seconds, > 0, after which what is measured is a change; None if it never is.
+        for_s: seconds, > 0, after which to end; None follows for ever.
     """
 
     async def follow(participant: ObserverParticipant) -> None:
         grace_period = GracePeriod()
         last: JudgedSystem | None = None
         clock = asyncio.get_running_loop().time
+        until_s = clock() + (float("inf") if for_s is None else for_s)
         pause_s = _ASK_AGAIN_S
         while True:
             seen = _judged(plan, await participant.graph.observe(plan), participant)
             before = None if last is None else last.verdict
-            now, again_s = grace_period.after(before, seen.verdict, seen.plan, clock())
-            if now != before or again_s is not None:
-                pause_s = _ASK_AGAIN_S
-            seen = replace(seen, verdict=now)
-            if seen != last:
-                last = seen
+            verdict, again_s = grace_period.after(before, seen.verdict, seen.plan, clock())
+            seen = replace(seen, verdict=verdict)
+            is_other = last is None or _apart_from_numbers(seen) != _apart_from_numbers(last)
+            measures = each_s is not None and bool(verdict.measured)
+            last = seen
+            if is_other or measures:
                 on_change(seen)
-            changed = await _change(participant, pause_s)
-            pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
+            if is_other or again_s is not None:
+                pause_s = _ASK_AGAIN_S
+            left_s = until_s - clock()
+            if left_s <= 0:
+                return
+            if each_s is not None and measures:
+                await asyncio.sleep(min(each_s, left_s))
+            else:
+                changed = await _change(participant, min(pause_s, left_s))
+                pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
 
     with _looking(plan) as participant:
         asyncio.run(follow(participant))
+
+
+def _apart_from_numbers(seen: JudgedSystem) -> JudgedSystem:
+    """Return what was seen without what is another number each time it is measured."""
+    configurations = (replace(each, measured=None) for each in seen.observation.configurations)
+    observation = replace(seen.observation, configurations=tuple(configurations))
+    return replace(seen, observation=observation, verdict=apart_from_numbers(seen.verdict))
 
 
 def _enter_domain(domain_id: int, discovery_range: DiscoveryRange) -> None:

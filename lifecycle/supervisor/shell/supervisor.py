@@ -150,6 +150,7 @@ class Supervisor:
         self._looks = Looks(self)
         self._load = Load(system)
         self._ros_interface = RosInterface(self)
+        self._server = ControlServer(means.directory.socket_path, self)
         self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
             effects.Ask: self._requests.ask,
             effects.Give: self._requests.give,
@@ -276,6 +277,8 @@ class Supervisor:
         self._say_states()
         for event in events:
             self._emit(event)
+        if isinstance(given, inputs.Verified) and given.verdict.measured:
+            self._server.changed()  # other numbers alone are no event
         self._requests.drop()
         wanted = advance.advance(run)
         self._say_states()
@@ -474,13 +477,12 @@ class Supervisor:
 
     async def run(self) -> UpResult:
         """Bring the system up, hold it, and take it down; never leaves anything running."""
-        server = ControlServer(self.means.directory.socket_path, self)
-        await server.open()
+        await self._server.open()
         self._peers.open()
 
         def changed(event: Event) -> None:
             if not isinstance(event, LogLine):
-                server.changed()
+                self._server.changed()
                 self._ros_interface.on_event(event)
 
         self._emit.listen(changed)
@@ -526,7 +528,7 @@ class Supervisor:
                     reason="" if run is None else run.reason,
                 )
             )
-            await server.close(result.exit_code)
+            await self._server.close(result.exit_code)
         if self._error is not None:
             raise self._error
         return result

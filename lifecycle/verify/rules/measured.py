@@ -18,13 +18,14 @@ import msgspec
 from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
 from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
+from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
-from lifecycle.verify.verdict import Finding, FlowMeasurement, MeasuredBound, Stage
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, brings_up
 
 PROBATION_S = 10.0
@@ -252,7 +253,8 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 p99_ms=_corrected(sample, 0.99, clock),
                 clock=clock if clock != SAME_CLOCK else None,
                 bounds=tuple(
-                    _bound(quantity, judgement) for quantity, _, judgement in each.judgements(view)
+                    _bound(quantity, bound, judgement)
+                    for quantity, bound, judgement in each.judgements(view)
                 ),
             )
         )
@@ -265,14 +267,16 @@ def _corrected(sample: Sample, quantile: float, clock: ClockOffset | None) -> fl
     return None if found is None or clock is None else max(0.0, found + clock.offset_ms)
 
 
-def _bound(quantity: Quantity, judgement: Judgement) -> MeasuredBound:
+def _bound(quantity: Quantity, bound: Bound, judgement: Judgement) -> MeasuredBound:
     undecided = "unverifiable" if _is_given_up(judgement) else "measuring"
     outcome = {None: undecided, True: "ok", False: "violated"}[judgement.kept]
     between = f", {undecided} " if judgement.observed and judgement.kept is None else " "
     return MeasuredBound(
         name=quantity.name,
+        kind=bound.kind,
         outcome=outcome,
         text=f"{judgement.observed}{between}{judgement.allowed}".strip(),
+        share=judgement.share,
         decides_in_s=judgement.decides_in_s,
     )
 

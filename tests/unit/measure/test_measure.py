@@ -210,4 +210,26 @@ def test_a_loss_is_compared_with_the_exact_share(number: int) -> None:
 )
 def test_a_judgement_has_numbers(bound: Bound, expected: Judgement) -> None:
     found = judge(bound, counted(steady(15, 5)[1:], until_s=5))
-    assert replace(found, decides_in_s=None) == expected
+    assert replace(found, decides_in_s=None, share=None) == expected
+
+
+@pytest.mark.parametrize(
+    ("bound", "hertz", "share"),
+    [
+        (Bound(kind=Kind.DELAY, most=4), 15, 0.25),
+        (Bound(kind=Kind.DELAY, most=0.5), 15, 2),
+        (Bound(kind=Kind.RATE, least=30, slack=0.05), 15, 0.5),
+        (Bound(kind=Kind.RATE, least=5, most=10), 15, 1.5),
+        (Bound(kind=Kind.RATE, least=10, most=20), 15, 1.5),
+        (Bound(kind=Kind.RATE, most=20), 15, 0.75),
+        (Bound(kind=Kind.LOSS, most=0.2), 15, 0),
+        (Bound(kind=Kind.SILENCE, most=1), 15, 0.03),
+    ],
+)
+def test_a_judgement_has_what_share_of_the_bound_was_measured(
+    bound: Bound, hertz: float, share: float
+) -> None:
+    found = judge(bound, counted(steady(hertz, 5), until_s=5)).share
+    assert found == pytest.approx(share, rel=0.05, abs=0.01)
+    nothing = Sample(seconds=0.0)
+    assert not judge(bound, nothing).share

@@ -8,6 +8,7 @@ import io
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import UniqueHow
+from lifecycle.measure.flows import NUMBERS, FlowMeasurement
 from lifecycle.network.nfe import (
     InternetProtocol,
     UniqueRequirement,
@@ -42,12 +43,23 @@ def rows(*reports: FlowReport) -> list[dict[str, str]]:
 
 def test_a_flow_is_one_line_with_its_5_tuple_dscp_and_verdict() -> None:
     header, line = flows_to_csv([VIDEO]).splitlines()
-    assert header == ",".join(COLUMNS)
+    assert header == ",".join((*COLUMNS, *NUMBERS))
     assert line == (
         "/robot/video,/robot/camera,/viewer,udp,ipv4,0.0.0.0,45000,10.0.0.2,7001,,46,EF,184,"
         "strongly,weakly,strictly_required,not_required,5,udp,ok,85,"
-        '"5QI 85, because",udpv4'
+        '"5QI 85, because",udpv4,,,,,'
     )
+    counted = FlowMeasurement(
+        topic=VIDEO.topic,
+        publisher=VIDEO.publisher,
+        subscription=VIDEO.subscription,
+        messages=74,
+        lost=None,
+        rate_hz=14.8,
+        p99_ms=0.6062,
+    )
+    _, line = flows_to_csv([VIDEO], {VIDEO.pair: counted}).splitlines()
+    assert line.endswith(",udpv4,74,,14.800,,0.606")
 
 
 def test_a_pair_with_several_flows_has_one_line_each() -> None:
@@ -81,6 +93,7 @@ def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:
     )
     (row,) = rows(report)
     assert {name for name, value in row.items() if not value} == {
+        *NUMBERS,
         "transport_protocol",
         "internet_protocol",
         "source_address",
@@ -100,4 +113,4 @@ def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:
 
 
 def test_no_flows_are_a_header_only() -> None:
-    assert flows_to_csv([]) == ",".join(COLUMNS) + "\n"
+    assert flows_to_csv([]) == ",".join((*COLUMNS, *NUMBERS)) + "\n"

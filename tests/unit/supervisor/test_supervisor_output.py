@@ -18,6 +18,8 @@ from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows, watched_flows
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, UniqueHow
+from lifecycle.measure.bounds import Kind
+from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
@@ -379,6 +381,31 @@ def test_a_status_is_a_head_a_line_for_each_node_and_its_connections_below_it() 
     )
 
 
+@pytest.mark.parametrize("is_measured", [False, True])
+def test_what_was_measured_is_one_line_of_a_status_and_of_the_live_table(is_measured: bool) -> None:
+    bound = MeasuredBound(
+        name="max_delay_ms", kind=Kind.DELAY, outcome="violated", text="delay p99 7.2 ms > 5 ms"
+    )
+    flow = FlowMeasurement(
+        topic="/video",
+        publisher="/camera",
+        subscription="/viewer",
+        messages=74,
+        lost=0,
+        rate_hz=14.8,
+        bounds=(bound,),
+    )
+    status = replace(STATUS, measured=(flow,) if is_measured else ())
+    line = "measured: 1 flow violated: /video /camera → /viewer: delay p99 7.2 ms > 5 ms"
+    assert status_text(status).splitlines()[1:][:is_measured] == [line] * is_measured
+    assert ("measured" in status_text(status)) == is_measured
+    console = Console(file=io.StringIO(), force_terminal=True, width=100, color_system=None)
+    with Live(console) as live:
+        live.watch(lambda: status)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert (line in shown, "measured:" in shown) == (is_measured, is_measured)
+
+
 def test_matches_that_nobody_reports_are_not_shown_as_none() -> None:
     (node,) = STATUS.nodes
     unknown = msgspec.structs.replace(node, matched=0, unreported=2)
@@ -424,8 +451,8 @@ def test_a_status_and_flows_fit_a_terminal_and_say_what_is_wrong_first(
 def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     head, row = render_flows([FLOW], "text").splitlines()
     assert " ".join(head.split()) == (
-        "topic publisher subscription source destination protocol flow_label dscp 5qi unique "
-        "required demanded transport verdict"
+        "topic publisher subscription rate_hz p50_ms p99_ms lost source destination protocol "
+        "flow_label dscp 5qi unique required demanded transport verdict"
     )
     assert row.split()[-2:] == ["shm", "ok"]  # what carries it, not what could
     for cell in (
@@ -447,7 +474,8 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     cells = dict(zip(csv_head.split(","), csv_row.split(","), strict=True))
     assert (cells["dscp"], cells["dscp_name"], cells["tos"]) == ("46", "EF", "184")
     assert (cells["five_qi"], cells["effective_transport"]) == ("85", "shm")
-    assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
+    (shown,) = json.loads(render_flows([FLOW], "json"))
+    assert (shown["topic"], shown["measured"]) == ("/video", None)
 
 
 async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok(

@@ -14,6 +14,8 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
+from lifecycle.measure.bounds import Kind
+from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.ros_interface import (
     BRINGS_UP_S,
@@ -21,12 +23,17 @@ from lifecycle.supervisor.control.ros_interface import (
     OK,
     STALE,
     WARN,
+    Entry,
+    Reported,
     check_installed,
+    diagnostics,
 )
 from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.verify.outcome import Outcome
 from tests import result_schemas
-from tests.unit.supervisor.fakes import run
+from tests.unit.supervisor.fakes import run, verdict_of
 from tests.unit.supervisor.session_world import CHAIN, INTRUDED, FakeRosInterface, SessionWorld
+from tests.unit.supervisor.test_supervisor_output import FLOW, STATUS
 
 OFF, FULL = RosInterfaceAccess.OFF, RosInterfaceAccess.FULL
 
@@ -174,3 +181,46 @@ async def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
         await asyncio.sleep(1.1)
         assert world.graph.ros is not None
         assert world.graph.ros.diagnostics[-1][0][0] == STALE
+
+
+def test_a_flow_with_declared_numbers_has_an_entry_that_stays_while_it_is_not_measured() -> None:
+    def shown(phase: str, outcome: Outcome, *measured: FlowMeasurement) -> list[Entry]:
+        status = replace(STATUS, phase=phase, nodes=(), measured=measured)
+        flow = replace(FLOW, outcome=outcome)
+        verdict = replace(verdict_of(Outcome.OK), flows=(flow, replace(flow, topic="/other")))
+        return [*diagnostics(status, verdict, reported, label="robot", source="us")]
+
+    def measured(outcome: str, text: str) -> FlowMeasurement:
+        bound = MeasuredBound(name="max_delay_ms", kind=Kind.DELAY, outcome=outcome, text=text)
+        return FlowMeasurement(
+            topic=FLOW.topic,
+            publisher=FLOW.publisher,
+            subscription=FLOW.subscription,
+            messages=74,
+            lost=1,
+            rate_hz=14.8,
+            p50_ms=0.5,
+            bounds=(bound,),
+        )
+
+    reported = Reported()
+    name = "robot: /video /camera → /viewer"
+    assert shown("activating", Outcome.OK) == []
+    undeclared = replace(measured("ok", ""), bounds=())
+    assert shown("active", Outcome.OK, undeclared) == []
+    late = measured("violated", "delay p99 7.2 ms > 5 ms")
+    numbers = (("messages", "74"), ("lost", "1"), ("rate_hz", "14.800"), ("p50_ms", "0.500"))
+    values = (*numbers, ("p99_ms", ""), ("max_delay_ms", "delay p99 7.2 ms > 5 ms"))
+    assert shown("active", Outcome.OK, late) == [
+        (ERROR, name, "delay p99 7.2 ms > 5 ms", "us", values)
+    ]
+    for outcome in ("measuring", "ok"):
+        (entry,) = shown("measuring", Outcome.OK, measured(outcome, "delay"))
+        assert entry[:3] == (OK, name, "delay")
+    assert [each[:3] for each in shown("paused", Outcome.OK)] == [
+        (WARN, name, "not measured, the system is paused")
+    ]
+    assert [each[:3] for each in shown("active", Outcome.OK)] == [(OK, name, "not measured")]
+    assert [each[:3] for each in shown("active", Outcome.VIOLATED)] == [
+        (ERROR, name, "not measured")
+    ]

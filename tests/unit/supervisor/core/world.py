@@ -29,11 +29,13 @@ from lifecycle.manifest.model import (
     Supervision,
     TargetState,
 )
+from lifecycle.measure.bounds import Kind
+from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
-from lifecycle.verify.verdict import Finding, FlowMeasurement, MeasuredBound, Verdict
+from lifecycle.verify.verdict import Finding, Verdict
 from tests.builders import HERE, plan_of, planned_endpoint, planned_node
 
 STEPS = 6_000
@@ -73,7 +75,9 @@ def verdict(*found: tuple[str, str]) -> Verdict:
 def measured(outcome: str, r: random.Random) -> FlowMeasurement:
     """What is measured of a flow of which one number is declared."""
     left_s = r.choice([None, 0.5, 30.0]) if outcome == "measuring" else None
-    bound = MeasuredBound(name="rate_hz", outcome=outcome, text="9.0 Hz", decides_in_s=left_s)
+    bound = MeasuredBound(
+        name="rate_hz", kind=Kind.RATE, outcome=outcome, text="9.0 Hz", decides_in_s=left_s
+    )
     return FlowMeasurement(
         topic="/data",
         publisher="/n0",
