@@ -101,7 +101,7 @@ class FlowMeasurement(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def outcome(self) -> str:
-        """Worst of its bounds: "violated", "unverifiable", "measuring" or "ok"; empty if none is declared."""
+        """Worst of its bounds: "violated", "unverifiable", "measuring", "ok"; empty without any."""
         found = {each.outcome for each in self.bounds}
         return next((each for each in _WORST_FIRST if each in found), "")
 
