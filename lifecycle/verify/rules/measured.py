@@ -227,7 +227,8 @@ def _judged(view: View, flow: FlowView) -> Iterator[Finding]:
                 ends=flow.ends,
             )
         elif _is_given_up(judgement) and view.clocks is not None:
-            why = _too_uncertain(quantity, bound, judgement, flow, _clock(view, flow, sample))
+            clock = _clock(view, flow, sample)
+            why = _too_uncertain(quantity, bound, judgement.observed, flow, clock)
             yield NOT_MEASURED.finding(
                 subject=flow.subject,
                 expected=str(quantity),
@@ -311,23 +312,18 @@ def _why_not(view: View, flow: FlowView, quantity: Quantity) -> str:
 
 
 def _too_uncertain(
-    quantity: Quantity,
-    bound: Bound,
-    judgement: Judgement,
-    flow: FlowView,
-    clock: ClockOffset | None,
+    quantity: Quantity, bound: Bound, observed: str, flow: FlowView, clock: ClockOffset | None
 ) -> str:
     """Return why a delay is not decided, for what is known of the clocks of the two hosts."""
     assert bound.most is not None
-    publisher, subscriber = (each.node.machine for each in flow.nodes)
-    clocks = f"the clocks of {publisher} and {subscriber}"
+    clocks = f"the clocks of {' and '.join(each.node.machine for each in flow.nodes)}"
     if clock is None:
         return f"{clocks} are not compared yet, or one was set a moment ago"
-    if clock.uncertainty_ms > bound.most:
-        named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
-        return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
-    found = f"{judgement.observed} may be more than {ms(bound.most)}, or not"
-    return f"{found}: {clocks} differ by {apart(clock)}"
+    if clock.uncertainty_ms <= bound.most:
+        differ = f"{clocks} differ by {apart(clock)}"
+        return f"{observed} may be more than {ms(bound.most)}, or not: {differ}"
+    named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
+    return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
 
 
 def _publishing(view: View, flow: FlowView) -> Iterator[FlowView]:
