@@ -114,7 +114,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
     if found is not None and clock is not None:
         delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
         observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
-        if clock.uncertainty_ns:
+        if clock.uncertainty_ms:
             # The bucket from which it was read is as large as this at most.
             unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
             observed += f" ± {ms(unsure_ms)}"

@@ -10,58 +10,45 @@ is what each of them allows (RFC 5905 §11.2.1), however asymmetric their ways a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import msgspec
 
-from lifecycle.codec import Count
 from lifecycle.measure.sample import DELAY_S
 
 KEPT = 8
 """Exchanges that are kept, as in NTP's clock filter (RFC 5905 §10)."""
 
 _DRIFT = 10_000
-"""Two clocks drift apart by one part of so many, 100 ppm, at most. RFC 5905 §7.1 allows 15 ppm for
+"""Two clocks drift apart by one part of so many, 100 ppm, at most. RFC 5905 §7.2 allows 15 ppm for
 one clock; the quartz of one that nothing disciplines is off by up to 50 ppm."""
 
-
 _JUDGED_NS = round(DELAY_S * 1e9)
+
+_Exchange = tuple[int, int, int, int]
+"""When it began and ended on our clock, and between what the offset was meanwhile."""
 
 
 class ClockOffset(msgspec.Struct, frozen=True, kw_only=True):
     """How far the clock of another host is ahead of ours.
 
     Attributes:
-        offset_ns: added to a time of ours it gives the other's; negative if that is behind.
-        uncertainty_ns: the offset is this much larger or smaller at most.
+        offset_ms: added to a time of ours it gives the other's; negative if that is behind.
+        uncertainty_ms: the offset is this much larger or smaller at most; 0 of one clock alone.
     """
 
-    offset_ns: int = 0
-    uncertainty_ns: Count = 0
-
-    @property
-    def offset_ms(self) -> float:
-        """In milliseconds, as `uncertainty_ms`."""
-        return self.offset_ns / 1e6
-
-    @property
-    def uncertainty_ms(self) -> float:
-        """In milliseconds."""
-        return self.uncertainty_ns / 1e6
-
-    @classmethod
-    def between(cls, low_ns: int, high_ns: int) -> ClockOffset:
-        """Return the offset that is between these."""
-        return cls(offset_ns=(low_ns + high_ns) // 2, uncertainty_ns=(high_ns - low_ns + 1) // 2)
+    offset_ms: float = 0.0
+    uncertainty_ms: float = 0.0
 
     @classmethod
     def any_of(cls, offsets: Iterable[ClockOffset]) -> ClockOffset:
         """Return what holds for each of these clocks, at least one."""
-        each = tuple(offsets)
-        return cls.between(
-            min(one.offset_ns - one.uncertainty_ns for one in each),
-            max(one.offset_ns + one.uncertainty_ns for one in each),
-        )
+        ends = [
+            (each.offset_ms - each.uncertainty_ms, each.offset_ms + each.uncertainty_ms)
+            for each in offsets
+        ]
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
+        return cls(offset_ms=(low + high) / 2, uncertainty_ms=(high - low) / 2)
 
 
 SAME_CLOCK = ClockOffset()
@@ -72,7 +59,7 @@ class ClockComparison:
     """Compares the clock of one other host with ours, in constant memory."""
 
     def __init__(self) -> None:
-        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
+        self._exchanges: deque[_Exchange] = deque(maxlen=KEPT)
         self._set_ns: int | None = None
 
     def add(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
@@ -86,13 +73,13 @@ class ClockComparison:
             t3_ns: later the other sent one, on its clock, ...
             t4_ns: ... and it was received, on ours.
         """
-        low_ns, high_ns = t3_ns - t4_ns, t2_ns - t1_ns
-        if t4_ns < t1_ns or low_ns > high_ns:
+        exchange = (t1_ns, t4_ns, t3_ns - t4_ns, t2_ns - t1_ns)
+        if t4_ns < t1_ns or _within([exchange], t4_ns) is None:
             return  # a clock was set in the middle of it
-        self._exchanges.append((t1_ns, low_ns, high_ns))
-        if self._within(t4_ns) is None:
+        self._exchanges.append(exchange)
+        if _within(self._exchanges, t4_ns) is None:
             self._exchanges.clear()
-            self._exchanges.append((t1_ns, low_ns, high_ns))
+            self._exchanges.append(exchange)
             self._set_ns = t4_ns
 
     def offset(self, now_ns: int) -> ClockOffset | None:
@@ -102,15 +89,17 @@ class ClockComparison:
         """
         if self._set_ns is not None and abs(now_ns - self._set_ns) < _JUDGED_NS:
             return None
-        now, before = self._within(now_ns), self._within(now_ns - _JUDGED_NS)
+        now = _within(self._exchanges, now_ns)
+        before = _within(self._exchanges, now_ns - _JUDGED_NS)
         return None if now is None or before is None else ClockOffset.any_of((now, before))
 
-    def _within(self, now_ns: int) -> ClockOffset | None:
-        """Return the offset at a time; None if there is none that is possible, or known."""
-        if not self._exchanges:
-            return None
-        # What it says held at some time since its first message was sent.
-        drifts = [abs(now_ns - sent_ns) // _DRIFT + 1 for sent_ns, _, _ in self._exchanges]
-        low = max(each[1] - drift for each, drift in zip(self._exchanges, drifts, strict=True))
-        high = min(each[2] + drift for each, drift in zip(self._exchanges, drifts, strict=True))
-        return ClockOffset.between(low, high) if low <= high else None
+
+def _within(exchanges: Collection[_Exchange], now_ns: int) -> ClockOffset | None:
+    """Return what all exchanges allow at a time; None if that is nothing, or there are none."""
+    # What each says was so at some time between its begin and its end.
+    drifts = [max(abs(now_ns - t1), abs(now_ns - t4)) // _DRIFT + 1 for t1, t4, _, _ in exchanges]
+    least = (low - drift for (_, _, low, _), drift in zip(exchanges, drifts, strict=True))
+    most = (high + drift for (_, _, _, high), drift in zip(exchanges, drifts, strict=True))
+    if not exchanges or (low := max(least)) > (high := min(most)):
+        return None
+    return ClockOffset(offset_ms=(low + high) / 2e6, uncertainty_ms=(high - low + 1) / 2e6)

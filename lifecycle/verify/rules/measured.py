@@ -385,11 +385,11 @@ def _too_uncertain(quantity: Quantity, bound: Bound, judgement: Judgement, of: _
     clocks, clock = f"the clocks of {publisher} and {subscriber}", of.clock
     if clock is None:
         return f"{clocks} are not compared yet, or one was set a moment ago"
-    if clock.uncertainty_ms > bound.most:
-        named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
-        return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
-    found = f"{judgement.observed} may be more than {ms(bound.most)}, or not"
-    return f"{found}: {clocks} differ by {apart(clock)}"
+    if clock.uncertainty_ms <= bound.most:
+        differ = f"{clocks} differ by {apart(clock)}"
+        return f"{judgement.observed} may be more than {ms(bound.most)}, or not: {differ}"
+    named = "" if quantity.name == "max_delay_ms" else f"the {ms(bound.most)} of "
+    return f"{clocks} differ by {apart(clock)}, which is more than {named}{quantity}"
 
 
 def _clock(view: View, flows: Sequence[FlowView], sample: Sample | None) -> ClockOffset | None:

@@ -65,7 +65,7 @@ def judged(
 
 
 def robot(uncertainty_ms: float) -> tuple[str, ClockOffset]:
-    return "robot", ClockOffset(offset_ns=512 * MS, uncertainty_ns=round(uncertainty_ms * MS))
+    return "robot", ClockOffset(offset_ms=512, uncertainty_ms=uncertainty_ms)
 
 
 def test_the_offset_is_subtracted_and_said_with_its_uncertainty() -> None:
@@ -141,9 +141,11 @@ def test_one_host_has_one_clock_whatever_its_machines_are_called() -> None:
 
 
 def test_messages_of_several_hosts_are_judged_by_all_of_their_clocks() -> None:
-    arm = "arm", ClockOffset(offset_ns=511 * MS, uncertainty_ns=MS // 10)
+    arm = "arm", ClockOffset(offset_ms=511, uncertainty_ms=0.1)
     verdict = judged(system("arm"), robot(0.1), arm)
-    assert verdict.measured[0].clock == ClockOffset(offset_ns=511_500_000, uncertainty_ns=600_000)
+    clock = verdict.measured[0].clock
+    assert clock is not None
+    assert (clock.offset_ms, clock.uncertainty_ms) == (511.5, pytest.approx(0.6))
     assert judged(system("arm"), robot(0.1)).measured[0].clock is None  # one is not known
     (found,) = judged(system("station"), robot(0.1)).findings
     assert f"{CLOCKS} differ by 256 ms ± 256 ms" in found.message
