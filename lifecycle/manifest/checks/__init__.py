@@ -17,6 +17,7 @@ from lifecycle.manifest.checks import (
     names,
     nodes,
     parameters,
+    readiness,
     transport,
 )
 from lifecycle.manifest.checks.system import DeclaredSystem
@@ -28,6 +29,7 @@ CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
     *names.CHECKS,
     *connections.CHECKS,
     *nodes.CHECKS,
+    *readiness.CHECKS,
     *parameters.CHECKS,
     *connection_urls.CHECKS,
     *flows.CHECKS,
