@@ -27,6 +27,7 @@ from lifecycle.manifest.model import (
     Manifest,
     Node,
     Policy,
+    Readiness,
     Run,
     RunKind,
     Supervision,
@@ -189,7 +190,7 @@ def planned_endpoint(
 def planned_node(
     key: str,
     *,
-    after: Mapping[str, Condition] = {},
+    after: Mapping[str, Condition | Readiness] = {},
     process: str = "",
     kind: RunKind = RunKind.PYTHON,
     managed: bool = True,

@@ -129,7 +129,7 @@ class Observer:
 
     # -- one observation
 
-    async def observe(self, plan: Plan) -> Observation:
+    async def observe(self, plan: Plan, *, only: Collection[str] | None = None) -> Observation:
         """Return what is there now, as the state has it then.
 
         Waits until every participant that was there before us is seen, which takes a moment at
@@ -137,7 +137,12 @@ class Observer:
 
         Planned nodes whose configuration was not put into the state are asked for their state and
         their configuration; what they do not answer within a second stays unknown. Those that
-        report no parameters, and of which some are planned, are asked for these (parameters.py).
+        report no parameters, and of which some are planned or waited for, are asked for these
+        (parameters.py).
+
+        Args:
+            plan: see above.
+            only: full names of the planned nodes that are asked; None for all.
 
         Raises:
             MiddlewareError: the graph can no longer be watched.
@@ -156,7 +161,8 @@ class Observer:
                 await asyncio.sleep(min(self.quiet_s, settling_s))
         self._show(nodes)
         given = self.state.given
-        judged = _judged_parameters(plan, self._present - given.keys())
+        asked = (planned if only is None else planned.intersection(only)) - given.keys()
+        judged = _judged_parameters(plan, self._present & asked)
         self._parameters.listen(judged)
         self._diagnostics.listen(
             {
@@ -166,12 +172,12 @@ class Observer:
             }
         )
         self._measurements.listen(plan)
-        answers = await self._ask_all(plan, nodes, planned - given.keys())
+        answers = await self._ask_all(plan, nodes, asked)
         self._answered = {name: said for name, (_, said) in answers.items() if said is not None}
         said = {**self.state.given, **self._answered}
         reporting = {name for name, each in said.items() if each.parameters is not None}
         if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
-            return await self.observe(plan)  # each node is waited for once
+            return await self.observe(plan, only=only)  # each node is waited for once
         for each in self._answered.values():
             self.state.learn(each)
         return self.state.observation(
@@ -395,14 +401,14 @@ class Observer:
 
 
 def _judged_parameters(plan: Plan, present: Collection[str]) -> dict[str, Names]:
-    """Return of which nodes that are there parameters are judged, and of which names."""
-    return {
-        node.full_name: None
-        if node.has_all_parameters
-        else frozenset(each.name for each in node.expected_parameters)
-        for node in plan.nodes
-        if (node.expected_parameters or node.has_all_parameters) and node.full_name in present
-    }
+    """Return of which nodes that are there parameters are judged or waited for: their names."""
+    awaited, found = plan.awaited, dict[str, Names]()
+    for node in plan.nodes:
+        names = {each.name for each in node.expected_parameters}
+        names |= {each.name for each in awaited.get(node.key, ()) if not each.by.kinds}
+        if (names or node.has_all_parameters) and node.full_name in present:
+            found[node.full_name] = None if node.has_all_parameters else frozenset(names)
+    return found
 
 
 def _says_as_before(status: NodeStatus | None, answer: NodeConfiguration | None) -> bool:

@@ -42,6 +42,8 @@ from lifecycle.manifest.model import (
     Quantity,
     Rate,
     Reaction,
+    Readiness,
+    ReadyBy,
     Resources,
     Run,
     RunKind,
@@ -241,10 +243,7 @@ def build_node(
             absolute(base, each.value.text) for each in cursor.items("parameter_files")
         ),
         remap=tuple((name, each.value.text) for name, each in cursor.entries("remap")),
-        after=tuple(
-            After(node=name, condition=Condition(each.scalar), at=each.key_at)
-            for name, each in cursor.entries("after")
-        ),
+        after=tuple(_after(cursor, found)),
         timeouts=section(cursor, "timeouts", Timeouts),
         supervision=cursor.build(Supervision),
         on_violation=build_on_violation(cursor),
@@ -256,6 +255,24 @@ def build_node(
         written_paths=tuple(_written_paths(cursor)),
         at=cursor.key_at,
     )
+
+
+def _after(node: Cursor, found: Findings) -> Iterator[After]:
+    for key, each in node.entries("after"):
+        if not isinstance(each.value.data, Mapping):
+            yield After(node=key, condition=Condition(each.scalar), at=each.key_at)
+            continue
+        for word, cursor in each.entries():
+            by, names = ReadyBy(word), list[tuple[str, ParameterValue | None, Position]]()
+            if isinstance(cursor.value.data, Mapping):
+                values = _flat(cursor.entries(), found)
+                names += [(name, value, at) for name, (value, at) in values.items()]
+            else:
+                so = True if by is ReadyBy.PARAMETER else None
+                items = cursor.items() if isinstance(cursor.value.data, tuple) else (cursor,)
+                names += [(each.value.text, so, each.at) for each in items]
+            for name, value, at in names:
+                yield After(node=key, condition=Readiness(by=by, name=name, value=value), at=at)
 
 
 def absolute(base: Path, path: str) -> str:

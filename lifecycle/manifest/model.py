@@ -7,6 +7,7 @@ Nothing here knows YAML. Pure.
 from __future__ import annotations
 
 import enum
+import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -132,6 +133,26 @@ class Condition(enum.Enum):
     CONNECTED = "connected"
     ACTIVE = "active"
     HEALTHY = "healthy"
+
+    def __str__(self) -> str:
+        """Return it as the manifest spells it."""
+        return self.value
+
+
+class ReadyBy(enum.Enum):
+    """What shows in the graph that a node is ready."""
+
+    PUBLISHES = "publishes"
+    SERVES = "serves"
+    PARAMETER = "parameter"
+
+    @property
+    def kinds(self) -> tuple[EndpointKind, ...]:
+        """Of which kind the endpoint may be that shows it; none for a parameter."""
+        return {
+            ReadyBy.PUBLISHES: (EndpointKind.PUBLISHER,),
+            ReadyBy.SERVES: (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER),
+        }.get(self, ())
 
 
 class DiscoveryMode(enum.Enum):
@@ -366,12 +387,40 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
     resources: Resources | None = None
 
 
+class Readiness(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What any node, also one that knows nothing of us, shows in the graph once it is ready.
+
+    It holds the configure of a managed node that waits for it, which may call the service or read
+    the topic, and the start of any other. The node that shows it must have started; it is waited
+    for before the gate opens, so it must not depend on that.
+
+    Attributes:
+        by: that it has a publisher, a server of a service or an action, or a parameter.
+        name: as the node's own code uses it, before its namespace and its remap rules.
+        value: of the parameter.
+    """
+
+    by: ReadyBy
+    name: str
+    value: ParameterValue | None = None
+
+    def __str__(self) -> str:
+        """Return it as people read it after the node's name: `publishes scan`."""
+        if self.by is not ReadyBy.PARAMETER:
+            return f"{self.by.value} {self.name}"
+        return f"has parameter {self.name}: {json.dumps(self.value, ensure_ascii=False)}"
+
+
 class After(msgspec.Struct, frozen=True, kw_only=True):
-    """The step of this node that `condition` names begins once `node` (a key) has reached it."""
+    """A step of this node, see `condition`, begins once `node` (a key) has reached it."""
 
     node: str
-    condition: Condition
+    condition: Condition | Readiness
     at: Position
+
+    def __str__(self) -> str:
+        """Return `driver active`, `driver publishes scan`."""
+        return f"{self.node} {self.condition}"
 
 
 class Timeouts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -15,7 +15,6 @@ from msgspec import Meta, Struct, field
 from lifecycle.manifest.model import (
     RULES_AND_FAMILIES,
     WORD,
-    Condition,
     DataLayer,
     Discovery,
     Dscp,
@@ -481,6 +480,37 @@ class Health(NodeHealth, frozen=True, kw_only=True):
         require(_written(self, self.ANY_OF) > 0)
 
 
+Level = Literal["started", "configured", "connected", "active", "healthy"]
+"""What a node may be waited for to be (`model.Condition`)."""
+
+Names = Text | Annotated[tuple[Text, ...], Meta(min_length=1)]
+
+
+class Ready(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What another node, of any program, shows in the graph once it is ready.
+
+    It is waited for until all that is written is there. A managed node waits with its configure,
+    any other with its start.
+
+    Attributes:
+        publishes: Topics that it has publishers of, by the names that its own code uses: relative,
+            absolute or ~/private, before its namespace and remapping.
+        serves: Services and actions that it has servers of, likewise.
+        parameter: Parameter that it has and that is true; or parameters and the values that they
+            have. Nested mappings are joined with dots.
+    """
+
+    ANY_OF: ClassVar[Ways] = (("publishes",), ("serves",), ("parameter",))
+
+    publishes: Annotated[Names, Meta(examples=["scan"])] | None = None
+    serves: Annotated[Names, Meta(examples=["~/reset"])] | None = None
+    parameter: Text | Annotated[dict[Text, ParameterTree], Meta(min_length=1)] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless something shows it."""
+        require(_written(self, self.ANY_OF) > 0)
+
+
 class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What endpoints ask of their network flows, by declared name.
 
@@ -550,7 +580,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
         remap: Remap rules, from: to.
         after: What each step waits for, by key of the other node: 'started' holds this node's
             start, 'configured' its configure, 'connected' its connect, 'active' its activate; so
-            does 'healthy', until the other is active and healthy.
+            does 'healthy', until the other is active and healthy. Or what it shows in the graph.
         interface: What the node offers and needs, with the keys of NoDL v2, or a NoDL document.
         connections: Connections that this node makes, by a name that is unique in it. Endpoints
             that none carries stay with the node's own participant.
@@ -576,7 +606,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     parameter_files: tuple[Text, ...] = ()
     remap: dict[Text, Text] = field(default_factory=dict)
-    after: dict[NodeKey, Condition] = field(default_factory=dict)
+    after: dict[NodeKey, Level | Ready] = field(default_factory=dict)
     timeouts: Timeouts = Timeouts()
     interface: Interface | InterfaceReference | None = None
     flows: Flows = Flows()

@@ -14,6 +14,7 @@ nodes where ports are given out in their order.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -140,7 +141,10 @@ def _node(node: PlannedNode) -> _Tree:
             for path, each in zip(node.parameter_files, files, strict=True)
         ],
         "remap": dict(node.remap),
-        "after": {each.node: each.condition.value for each in node.after},
+        "after": {
+            key: " and ".join(str(each.condition) for each in group)
+            for key, group in itertools.groupby(node.after, key=lambda each: each.node)
+        },
         "interface": _interface(node),
         "flows": _flows(node),
         "connections": {

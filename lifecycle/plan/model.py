@@ -26,6 +26,7 @@ from lifecycle.manifest.model import (
     ParameterDeclaration,
     ParameterValue,
     Quantity,
+    Readiness,
     Run,
     SystemDeclaration,
     TargetState,
@@ -401,6 +402,15 @@ class Plan(SystemDeclaration, frozen=True, kw_only=True):
             if node.key == key:
                 return node
         raise KeyError(key)
+
+    @property
+    def awaited(self) -> dict[str, frozenset[Readiness]]:
+        """What others wait for of each node, by its key, that the graph shows."""
+        found: dict[str, frozenset[Readiness]] = {}
+        for after in (each for node in self.nodes for each in node.after):
+            if isinstance(after.condition, Readiness):
+                found[after.node] = found.get(after.node, frozenset()) | {after.condition}
+        return found
 
     @property
     def bounds(self) -> tuple[Quantity, ...]:

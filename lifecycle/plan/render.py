@@ -169,7 +169,7 @@ def _order(plan: Plan, width: int) -> list[str]:
 
 
 def _waiting(node: PlannedNode) -> str:
-    waits = " and ".join(f"{each.node} {each.condition.value}" for each in node.after)
+    waits = " and ".join(map(str, node.after))
     return f"{node.key} (after {waits})" if waits else node.key
 
 

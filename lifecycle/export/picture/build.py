@@ -156,7 +156,7 @@ class _Builder:
         if planned is not None and planned.run.kind is RunKind.ATTACH:
             yield "started by others"
         if planned is not None and self._verdict is None:
-            yield from (f"after {each.node} {each.condition.value}" for each in planned.after)
+            yield from (f"after {each}" for each in planned.after)
         if observed is not None and observed.count > 1:
             yield f"{observed.count} of this name"
 

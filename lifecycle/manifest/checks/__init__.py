@@ -18,6 +18,7 @@ from lifecycle.manifest.checks import (
     nodes,
     numbers,
     parameters,
+    readiness,
     transport,
 )
 from lifecycle.manifest.checks.system import DeclaredSystem
@@ -29,6 +30,7 @@ CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
     *names.CHECKS,
     *connections.CHECKS,
     *nodes.CHECKS,
+    *readiness.CHECKS,
     *parameters.CHECKS,
     *connection_urls.CHECKS,
     *flows.CHECKS,

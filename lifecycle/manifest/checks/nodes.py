@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
@@ -217,7 +217,7 @@ def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 beyond = after.condition in (Condition.ACTIVE, Condition.HEALTHY)
                 if beyond and after.node in mode.inactive:
                     message = (
-                        f"cannot wait until {after.node!r} is {after.condition.value}: mode "
+                        f"cannot wait until {after.node!r} is {after.condition}: mode "
                         f"{mode.name!r} ({mode.at.spelled}) keeps it inactive"
                     )
                     hint = f"write '{after.node}: connected', or remove it from the mode"
@@ -473,7 +473,7 @@ def _participants(nodes: list[Node], system: DeclaredSystem) -> int:
 def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the start order of nodes."""
     for node in system.manifest.nodes:
-        for after in node.after:
+        for after in _once(node.after):
             if after.node not in system.nodes:
                 message = f"cannot wait for node {after.node!r}: there is no such node"
                 hint = did_you_mean(after.node, system.nodes)
@@ -487,9 +487,16 @@ def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
     yield from cycles(system)
 
 
+def _once(afters: Iterable[After]) -> list[After]:
+    """Return the first for each node that is waited for: of what it shows there may be several."""
+    return [*{each.node: each for each in reversed([*afters])}.values()][::-1]
+
+
 def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
     """Judge conditions of nodes that have nothing but a start (see `Condition`)."""
     key, condition = after.node, after.condition
+    if not isinstance(condition, Condition):
+        return
     if condition is Condition.HEALTHY and other.health is None:
         message = f"cannot wait until {key!r} is healthy: nothing says how that is known"
         yield error(
@@ -519,13 +526,13 @@ _FURTHEST = {
 
 def _kept_lower(after: After, other: Node) -> Iterator[Diagnostic]:
     """Judge conditions that the supervisor keeps from ever holding."""
-    if not other.managed:
+    if not other.managed or not isinstance(after.condition, Condition):
         return
     order = list(Condition)
     furthest = _FURTHEST[other.state]
     if order.index(after.condition) > order.index(furthest):
         key, kept = after.node, other.state.value
-        message = f"cannot wait until {key!r} is {after.condition.value}: it is kept {kept}"
+        message = f"cannot wait until {key!r} is {after.condition}: it is kept {kept}"
         hint = f"write '{key}: {furthest.value}', or remove its 'state: {kept}'"
         yield error("check.after-state", after.at, message, hint)
 
@@ -533,7 +540,7 @@ def _kept_lower(after: After, other: Node) -> Iterator[Diagnostic]:
 def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Report each circle once, at the edge that closes it; iterative, so depth has no limit."""
     edges = {
-        key: [each for each in node.after if each.node in system.nodes and each.node != key]
+        key: [each for each in _once(node.after) if each.node in system.nodes and each.node != key]
         for key, node in system.nodes.items()
     }
     done: set[str] = set()

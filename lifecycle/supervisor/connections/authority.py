@@ -19,7 +19,7 @@ import msgspec
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
-from lifecycle.manifest.model import After, Authority, Condition, DataLayerSource
+from lifecycle.manifest.model import After, Authority, Condition, DataLayerSource, Readiness
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections.desired_state import (
@@ -30,7 +30,7 @@ from lifecycle.supervisor.connections.desired_state import (
     wired,
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.core.state import Level, held_level
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
@@ -55,8 +55,9 @@ def configured_before_any_connect(system: System) -> frozenset[str]:
 
     Nothing where nothing is negotiated.
 
-    A managed node's start waits for `started` alone and its configure for `configured`; but the
-    start of a plain node waits for any condition, and a node that depends on it waits with it.
+    A managed node's start waits for `started` alone and its configure for `configured`, and for
+    what others show, which they may have once they are connected; but the start of a plain node
+    waits for any condition, and a node that depends on it waits with it.
     """
     if system.plan.data_layer.source is not DataLayerSource.DYNAMIC:
         return frozenset()
@@ -64,10 +65,11 @@ def configured_before_any_connect(system: System) -> frozenset[str]:
     held: set[str] = set()
 
     def is_held(node: PlannedNode, after: After) -> bool:
-        if node.managed and after.condition not in (Condition.STARTED, Condition.CONFIGURED):
+        if held_level(node, after.condition) > Level.CONFIGURED:
             return False
         connects = after.node not in planned or planned[after.node].managed
-        return after.node in held or (connects and after.condition in _BEYOND)
+        beyond = after.condition in _BEYOND or isinstance(after.condition, Readiness)
+        return after.node in held or (connects and beyond)
 
     while more := {
         key

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import Condition, Restart, RunKind
+from lifecycle.manifest.model import After, Condition, Readiness, Restart, RunKind
+from lifecycle.plan.model import HeldBy
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
 from lifecycle.supervisor.core import effects, gate
 from lifecycle.supervisor.core.state import (
@@ -23,6 +24,7 @@ from lifecycle.supervisor.core.state import (
     Request,
     Run,
     Step,
+    held_level,
 )
 from lifecycle.verify.verdict import Stage
 
@@ -85,7 +87,7 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
     needs = (
         run.nodes[after.node]
         for after in node.planned.after
-        if HOLDS[after.condition] is Level.ACTIVE and after.node in run.nodes
+        if held_level(node.planned, after.condition) is Level.ACTIVE and after.node in run.nodes
     )
     # One that is away comes again; one that is kept inactive does not.
     return any(
@@ -96,11 +98,13 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
     )
 
 
-def has_reached(run: Run, key: str, condition: Condition) -> bool:
+def has_reached(run: Run, key: str, condition: Condition | Readiness) -> bool:
     """Return whether a node is as far as another waits for: a plain one has to be started."""
     node = run.nodes.get(key)
     if node is None:
         return condition in run.elsewhere.get(key, ())
+    if isinstance(condition, Readiness):
+        return condition in node.shown and node.level >= Level.STARTED
     process = run.process_of(node)
     if process is not None and process.is_over:
         return condition is not Condition.HEALTHY
@@ -113,10 +117,9 @@ def has_reached(run: Run, key: str, condition: Condition) -> bool:
 def holds_up(run: Run, node: Node, target: Level) -> str:
     """Return what a step to this level waits for, `/a is active`; empty if nothing holds it."""
     for after in node.planned.after:
-        step = HOLDS[after.condition] if node.planned.managed else Level.STARTED
+        step = held_level(node.planned, after.condition)
         if step <= target and not has_reached(run, after.node, after.condition):
-            other = run.plan.node(after.node).full_name
-            return f"{other} is {after.condition.value}"
+            return _awaited(run, after)
     container = run.nodes.get(node.planned.run.container)
     if node.planned.run.component and container is not None and container.level < Level.STARTED:
         return f"{container.name} is started"
@@ -126,6 +129,16 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
         late = (each.name for each in early if each.level < Level.CONFIGURED)
         return next((f"{name} is configured" for name in late), "")
     return ""
+
+
+def _awaited(run: Run, after: After) -> str:
+    """Return what a node is to have reached, `/a is active`; what it shows also with the place."""
+    other = run.plan.node(after.node)
+    if isinstance(after.condition, Condition):
+        return f"{other.full_name} is {after.condition}"
+    held = other.held_by is HeldBy.EXECUTOR
+    why = "; none of its callbacks runs before the gate opens" if held else ""
+    return f"{other.full_name} {after.condition} ({after.at.spelled}{why})"
 
 
 def goal_of(run: Run, node: Node) -> Level:

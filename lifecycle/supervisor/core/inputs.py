@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from lifecycle.manifest.model import Condition
+from lifecycle.manifest.model import Condition, Readiness
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
@@ -97,13 +97,15 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         levels: of nodes of ours whose state others may change.
         health: whether nodes are healthy, as far as that is known.
+        shown: what others wait for of nodes of ours, as far as the graph shows it.
         elsewhere: conditions that nodes of other supervisors have reached.
         left: full names of all nodes whose supervisor was shut down; None if nothing is new.
     """
 
     levels: Mapping[str, Level] = {}
     health: Mapping[str, bool] = {}
-    elsewhere: Mapping[str, frozenset[Condition]] = {}
+    shown: Mapping[str, frozenset[Readiness]] = {}
+    elsewhere: Mapping[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] | None = None
 
 

@@ -137,6 +137,7 @@ def _is_down(node: Node) -> None:
     node.request = None
     node.stuck = node.wired = node.healthy = node.let_through = False
     node.silent, node.hangs, node.guarded = "", "", 0
+    node.shown = frozenset()
 
 
 def _swept(run: Run, given: inputs.Swept) -> list[Event]:
@@ -206,6 +207,8 @@ def _replied(run: Run, given: inputs.Replied) -> list[Event]:
         node.wired = True
     elif step is Step.DISCONNECT:
         node.wired = False
+    if node.level is Level.DOWN:
+        node.shown = frozenset()
     if step is Step.DEACTIVATE and node.level < Level.ACTIVE:
         node.let_through = False
     return []
@@ -247,6 +250,10 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
     for key, healthy in given.health.items():
         if key in run.nodes and run.nodes[key].healthy != healthy:
             run.nodes[key].healthy = healthy
+            run.changed()
+    for key, shown in given.shown.items():
+        if key in run.nodes and run.nodes[key].shown != shown:
+            run.nodes[key].shown = shown
             run.changed()
     for key, conditions in given.elsewhere.items():
         if run.elsewhere.get(key) != conditions:

@@ -17,7 +17,14 @@ from collections.abc import Iterable, Iterator
 import msgspec
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, OnFailure, RunKind, Supervision, TargetState
+from lifecycle.manifest.model import (
+    Condition,
+    OnFailure,
+    Readiness,
+    RunKind,
+    Supervision,
+    TargetState,
+)
 from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
@@ -91,6 +98,13 @@ HOLDS = {
 """The level that a condition of `after` stands for, in both nodes."""
 
 
+def held_level(node: PlannedNode, condition: Condition | Readiness) -> Level:
+    """Return the level whose step a condition of its `after` holds in a node."""
+    if not node.managed:
+        return Level.STARTED
+    return Level.CONFIGURED if isinstance(condition, Readiness) else HOLDS[condition]
+
+
 class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
@@ -125,6 +139,7 @@ class Node(msgspec.Struct, kw_only=True):
         stuck: a request to it was given up; a further one would wait behind it.
         silent: why it cannot be reached; empty while it can.
         hangs: why its process's watchdog is to end it, if it has one; empty while it does not hang.
+        shown: what others wait for of it, as far as the graph shows it.
         renew: it is to go down once, whatever it is wanted to be.
         due_s: it is not started before.
         withheld: why a consequence keeps it inactive until a person lets it through the gate.
@@ -143,6 +158,7 @@ class Node(msgspec.Struct, kw_only=True):
     stuck: bool = False
     silent: str = ""
     hangs: str = ""
+    shown: frozenset[Readiness] = frozenset()
     renew: bool = False
     due_s: float = 0.0
     withheld: str = ""
@@ -497,7 +513,7 @@ class Run(msgspec.Struct, kw_only=True):
     first: Plan
     nodes: dict[str, Node]
     processes: dict[str, Process]
-    elsewhere: dict[str, frozenset[Condition]] = {}
+    elsewhere: dict[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] = frozenset()
     early: frozenset[str] = frozenset()
     adopted: frozenset[str] = frozenset()

@@ -19,22 +19,22 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from msgspec.structs import replace
-
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
 from lifecycle.measure.sample import SLOT_S
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core.state import NEVER_S, Level
 from lifecycle.supervisor.judging.grace_period import GracePeriod
+from lifecycle.supervisor.judging.judge import without
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.readiness import shown
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.health import health_of
@@ -44,6 +44,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 if TYPE_CHECKING:
     from lifecycle.supervisor.core.state import Passage
     from lifecycle.supervisor.nodes.system import NodeRun
+    from lifecycle.supervisor.processes.process import ManagedProcess
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 QUIET_S = 0.005
@@ -113,6 +114,7 @@ class Looks:
         while True:
             self._shell.catch_up()
             mark, stage, away = run.mark, advance.stage_of(run), run.away
+            began = dict(self._system.processes)
             found = await judge.look(stage)
             closes = gate.closes(found, strict=run.options.strict)
             if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
@@ -126,7 +128,7 @@ class Looks:
             lately = loop.time() < newcomers_until_s
             if not (lately and self._graph.discovery.settling.expect_newcomers()):
                 break  # else the next look waits for them
-        self._saw(judge.seen)
+        self._saw(judge.seen, began)
         self._was_stale = run.mark != mark
         self._shell.give(self._verified(mark, stage, away, found))
 
@@ -238,9 +240,11 @@ class Looks:
         """Look at nodes of others, and at ours that others may drive, while no verdict is made."""
         while True:
             changed = self._shell.changed
-            plan = self._followed()
-            if plan.nodes and not self._is_looked_at():
-                self._saw(await self._graph.observe(plan))
+            asked, looks = self._followed()
+            if looks and not self._is_looked_at():
+                began = dict(self._system.processes)
+                seen = await self._graph.observe(self._system.plan, only=asked)
+                self._saw(seen, began)
             remote = any(self._system.run.elsewhere.values())
             await set_within(changed, REMOTE_S if remote else None)
 
@@ -248,8 +252,9 @@ class Looks:
         run = self._system.run
         return run.judged.looking or run.is_watched or advance.is_at_gate(run)
 
-    def _followed(self) -> Plan:
-        run = self._system.run
+    def _followed(self) -> tuple[frozenset[str], bool]:
+        """Return the names of the nodes that are asked, and whether it is to be looked at all."""
+        run, ready = self._system.run, self._system.plan.awaited
         awaited = {after.node for each in run.nodes.values() for after in each.planned.after}
         healthy = {
             after.node
@@ -260,13 +265,21 @@ class Looks:
         keys = {key for key in run.elsewhere if key in awaited}
         for key, node in self._system.nodes.items():
             foreign = node.planned.managed and not node.is_hosted
-            if foreign or (key in healthy and not node.reports_health):
+            reads = any(not each.by.kinds for each in ready.get(key, ()))
+            if foreign or reads or (key in healthy and not node.reports_health):
                 keys.add(key)
-        return replace(run.plan, nodes=tuple(each for each in run.plan.nodes if each.key in keys))
+        names = frozenset(run.plan.node(key).full_name for key in keys)
+        return names, bool(names or ready)
 
-    def _saw(self, seen: Observation) -> None:
-        """Say what is seen of nodes that do not report to us, where that is new."""
-        nodes = self._system.nodes
+    def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:
+        """Say what is seen of nodes that do not report to us, where that is new.
+
+        Args:
+            seen: by one look.
+            began: the processes when it began: of one that has died since it shows nothing.
+        """
+        nodes, awaited = self._system.nodes, self._system.plan.awaited
+        seen = without(seen, self._system.dead())
         states = {each.full_name: each.state for each in seen.nodes}
         own = {each.name: own_health(each) for each in seen.configurations}
         published = {each.full_name: each.health for each in seen.nodes}
@@ -278,8 +291,16 @@ class Looks:
             if not node.reports_health:
                 node.health = own.get(node.name), published.get(node.name)
             health[key] = node.is_healthy
-        elsewhere = {key: conditions(each, seen) for key, each in self._system.remote.items()}
-        saw = inputs.Saw(levels=levels, health=health, elsewhere=elsewhere)
+        elsewhere = {
+            key: conditions(each, seen) | shown(awaited.get(key, ()), each, seen)
+            for key, each in self._system.remote.items()
+        }
+        ready = {
+            key: shown(awaited[key], node.planned, seen)
+            for key, node in nodes.items()
+            if key in awaited and node.process is began.get(node.core.process)
+        }
+        saw = inputs.Saw(levels=levels, health=health, shown=ready, elsewhere=elsewhere)
         if saw != self._seen_last or levels:
             self._seen_last = saw
             self._shell.give(saw)

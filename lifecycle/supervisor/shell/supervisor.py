@@ -348,8 +348,11 @@ class Supervisor:
         if self._touched or graph.changes != self._graph_changes or self.judge.is_behind:
             self._touched, self._graph_changes = False, graph.changes
             self.give(inputs.Changed())
-            self.changed.set()
-            self.changed = asyncio.Event()
+            self._wake_looks()
+
+    def _wake_looks(self) -> None:
+        self.changed.set()
+        self.changed = asyncio.Event()
 
     def _touch(self) -> None:
         """Note a change; changes come in bursts, and are taken once for all that come at once."""
@@ -405,6 +408,7 @@ class Supervisor:
         self._plans, again, self.again = (run.plan, run.first), frozenset(self.again), set()
         if run.plan is not plan:
             self.system.expected = run.plan
+            self._wake_looks()  # others may be waited for, or for something else
         if self.authority is not None:
             self.authority.replan(run.plan, again)
             run.early = configured_before_any_connect(self.system)

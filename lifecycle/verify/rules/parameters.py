@@ -164,7 +164,7 @@ def _judge(
             message=f"{what} is {_with_type(actual)}, and must be "
             f"{expected.type} as {_origin(expected)}",
         )
-    elif expected.value is not None and not _is_value(actual, expected.value):
+    elif expected.value is not None and not is_value(actual, expected.value):
         wanted = spell(expected.value, expected.type)
         hint = ""
         if expected.source == DEFAULT:
@@ -284,7 +284,7 @@ def _is_of_type(actual: ParameterReport, type_: str) -> bool:
     return actual.type == type_
 
 
-def _is_value(actual: ParameterReport, value: ParameterValue) -> bool:
+def is_value(actual: ParameterReport, value: ParameterValue) -> bool:
     """Compare values of one type; what is not a number equals itself, and 0.0 equals -0.0."""
     if actual.digest:
         return actual.digest == digest_of(value)

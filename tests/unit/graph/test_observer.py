@@ -15,7 +15,10 @@ from lifecycle.graph.diagnostics import Diagnostic, DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.observer import Observer
 from lifecycle.manifest.model import (
+    After,
     EndpointKind,
+    Readiness,
+    ReadyBy,
     Run,
     RunKind,
 )
@@ -377,6 +380,21 @@ def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_plann
     assert seen.parameters == (NodeParameters(node="/foreign", parameters=(gain,)),)
     assert clients.read == [("/foreign", frozenset({"gain"}))]
     assert clients.listening
+
+
+def test_a_parameter_that_is_waited_for_is_read_too_by_looks_at_all_and_at_its_node_alone(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes = managed("/foreign", "/viewer")
+    ready = Readiness(by=ReadyBy.PARAMETER, name="ready", value=True)
+    made = with_parameter(plan("foreign", "viewer"), "foreign", "viewer")
+    after = After(node="foreign", condition=ready, at=made.nodes[0].at)
+    made = replace(made, nodes=(made.nodes[0], replace(made.nodes[1], after=(after,))))
+    run(observer.observe(made, only=frozenset({"/foreign"})))
+    assert clients.read == [("/foreign", frozenset({"gain", "ready"}))]
+    run(observer.observe(made, only=frozenset()))
+    run(observer.observe(made))  # the same names: nothing is read anew
+    assert clients.read[1:] == [("/viewer", frozenset({"gain"}))]
 
 
 def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(

@@ -10,7 +10,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+)
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -176,8 +184,8 @@ class FakeParticipant:
         del everybody
         return False
 
-    async def observe(self, plan: Plan) -> Observation:
-        del plan
+    async def observe(self, plan: Plan, *, only: Collection[str] | None = None) -> Observation:
+        del plan, only
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(

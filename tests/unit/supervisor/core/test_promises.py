@@ -57,6 +57,8 @@ MUTANTS = [
         "tuple(Level)",
     ),
     ("order", "advance.py", "    if holds_up(run, node, target):", "    if False:"),
+    ("order", "advance.py", "condition in node.shown and ", ""),
+    ("order", "reduce.py", "    node.shown = frozenset()\n\n", "\n"),
     ("order", "advance.py", "    return not run.hurry and any(", "    return False and any("),
     ("ends", "advance.py", "process.asked = min(process.asked + 1, ", "process.asked = min(0, "),
     ("ends", "advance.py", "    run.wakes_at(process.asked_until_s)\n", ""),

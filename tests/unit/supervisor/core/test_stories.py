@@ -36,7 +36,7 @@ from lifecycle.supervisor.run.events import (
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.core.playbook import Play
-from tests.unit.supervisor.core.world import verdict
+from tests.unit.supervisor.core.world import READY, verdict
 
 AGAIN = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
@@ -211,6 +211,29 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     assert play.levels == "1"
     play.give(inputs.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
     assert play.levels == "4"
+
+
+@pytest.mark.parametrize(("managed", "held"), [(True, "viewer configure"), (False, "spawn viewer")])
+def test_a_node_waits_for_what_another_shows_and_again_once_that_has_died(
+    managed: bool, held: str
+) -> None:
+    how = msgspec.structs.replace(AGAIN, on_failure=OnFailure.DEPENDENTS)
+    viewer = planned_node("viewer", kind=RunKind.COMMAND, managed=managed, after={"camera": READY})
+    play = Play(plan_of(planned_node("camera", supervision=how), viewer))
+    shows = inputs.Saw(shown={"camera": frozenset({READY})})
+    assert held in play.give(shows)
+    play.die("camera")
+    assert held not in play.wait(5.0)
+    assert held in play.give(shows)
+
+
+def test_the_deadline_names_what_is_waited_for_and_where_that_is_written() -> None:
+    play = Play(plan_of(planned_node("camera"), planned_node("viewer", after={"camera": READY})))
+    play.wait(30.0)
+    (failure,) = [each for each in play.events if isinstance(each, Failure)]
+    said = f"/viewer waits to configure until /camera publishes scan ({HERE.spelled})"
+    assert (failure.rule, play.code) == ("run.deadline", 6)
+    assert said in failure.message
 
 
 def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:

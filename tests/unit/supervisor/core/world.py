@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import importlib
 import random
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
@@ -24,6 +24,8 @@ from lifecycle.manifest.model import (
     OnFailure,
     Quantity,
     Reaction,
+    Readiness,
+    ReadyBy,
     Restart,
     RunKind,
     Supervision,
@@ -40,6 +42,15 @@ from tests.builders import HERE, plan_of, planned_endpoint, planned_node
 
 STEPS = 6_000
 """No story takes more."""
+
+READY = Readiness(by=ReadyBy.PUBLISHES, name="scan")
+"""What a node shows some time after it was started."""
+
+
+class Show(NamedTuple):
+    """A node is about to show it."""
+
+    node: str
 
 
 class Core:
@@ -138,6 +149,18 @@ def random_plan(r: random.Random) -> Plan:
     return replace(plan, modes=modes) if r.random() < 0.5 else plan
 
 
+def with_readiness(plan: Plan, r: random.Random) -> Plan:
+    """The same system, in which nodes wait for what others show."""
+
+    def waits(node: PlannedNode) -> PlannedNode:
+        ready = (replace(each, condition=READY) for each in node.after)
+        return replace(
+            node, after=tuple(r.choice(each) for each in zip(node.after, ready, strict=True))
+        )
+
+    return replace(plan, nodes=tuple(map(waits, plan.nodes)))
+
+
 _KINDS = (
     *4 * [(RunKind.PYTHON, True)],
     (RunKind.PYTHON, False),
@@ -163,10 +186,13 @@ class World:
         self.core, self.r = core, random.Random(seed)
         r = self.r
         self.plan = random_plan(r)
+        if seed % 5 == 0:
+            self.plan = with_readiness(self.plan, random.Random(seed))
         self.level_of: dict[str, int] = {each.key: 0 for each in self.plan.nodes}
         self.alive: dict[str, bool] = {}
         self.unswept: set[str] = set()
         self.let: set[str] = set()
+        self.shown: set[str] = set()
         self.pending: list[Any] = []
         self.now_s = 0.0
         self.wake_s = float("inf")
@@ -291,6 +317,10 @@ class World:
         elif kind == "Look":
             self.judged_mark = self.looks[effect.mark]
             self.give(inputs.Verified(mark=effect.mark, verdict=self.judge()))
+        elif kind == "Show":
+            if self.level_of[effect.node] and effect.node not in self.shown:
+                self.shown.add(effect.node)
+                self.give(inputs.Saw(shown={effect.node: frozenset({READY})}))
         elif kind == "Program":
             self.give(inputs.Programmed(number=effect.number))
         elif kind == "Give":
@@ -328,6 +358,10 @@ class World:
         self.level_of[effect.node] = int(level)
         if effect.step.value == "deactivate":
             self.let.discard(effect.node)
+        if effect.step.value == "start" and effect.node in self.run.plan.awaited:
+            self.pending.append(Show(effect.node))
+        if not level:
+            self.shown.discard(effect.node)
         self.give(self.core.inputs.Replied(node=effect.node, number=effect.number, level=level))
 
     def exit(self, process: str, *, status: int | None) -> None:
@@ -337,6 +371,7 @@ class World:
             if process in (each.process, self.container_of(each)):
                 self.level_of[each.key] = 0
                 self.let.discard(each.key)
+                self.shown.discard(each.key)
         sent = self.run.processes[process].sent
         number = 0 if status is not None else sent[-1] if sent and sent[-1] else 11
         self.give(
@@ -489,6 +524,10 @@ class World:
             assert not self.alive.get(effect.process), "processes: spawned while it lives"
             assert effect.process not in self.unswept, "processes: spawned beside what is left"
             assert run.ending is None, "processes: spawned while the run ends"
+            for each in run.nodes_of(effect.process):
+                self.check_shown(each, managed=False)
+        if kind == "Ask" and effect.step.value == "configure":
+            self.check_shown(run.nodes[effect.node], managed=True)
         if kind == "Ask" and run.ending is not None:
             up = effect.step.value in ("start", "configure", "connect", "wire", "activate")
             assert not up, f"withheld: {effect.step.value} while the run ends"
@@ -512,6 +551,12 @@ class World:
             least = 4 if other is None or other.planned.managed else 1
             active = self.level_of.get(after.node, 0) >= least
             assert after.condition is not Condition.ACTIVE or active, "order: activated too early"
+
+    def check_shown(self, node: Any, *, managed: bool) -> None:
+        """What waits for what others show, begins once they do: a plain node with its start."""
+        awaited = {each.node for each in node.planned.after if each.condition == READY}
+        missing = awaited & self.run.nodes.keys() - self.shown
+        assert node.planned.managed is not managed or not missing, "order: begun too early"
 
     def check_order_down(self, effect: Any) -> None:
         if self.run.ending is None:
