@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from lifecycle.errors import ExitCode
 from lifecycle.supervisor.control.client import down, status
 from tests.net.hosts import Host, Hosts
 from tests.net.running import UNIQUE, article, run_directory, up_on, up_on_both
-from tests.ros.supervisor.running import BOUND_S, Up
+from tests.ros.supervisor.running import BOUND_S, ROOT, Up
 
 _TOPICS = [
     {"name": "video", "type": "std_msgs/msg/String", "qos": "sensor_data"},
@@ -131,6 +132,38 @@ def test_a_step_waits_for_a_node_on_another_host(pair: tuple[Host, Host], tmp_pa
             ExitCode.OK,
             ExitCode.OK,
         ]
+        assert (up_a.finish(), up_b.finish()) == (ExitCode.OK, ExitCode.OK)
+
+
+def test_a_step_waits_for_what_a_driver_shows_on_another_host(
+    pair: tuple[Host, Host], tmp_path: Path
+) -> None:
+    notes = tmp_path / "notes"
+    run = {
+        "command": [sys.executable, "-m", "tests.ros.supervisor.late_driver", "driver"],
+        "environment": {"NOTES": str(notes), "COMES": "publishes:2 serves:1"},
+        "working_directory": str(ROOT),
+    }
+    edit = {
+        "nodes/driver": {"run": run, "machine": "a", "managed": False, "endpoints": "open"},
+        "nodes/n2/after": {
+            "driver": {"publishes": "scan", "serves": "~/reset", "parameter": {"ready": False}}
+        },
+    }
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
+    with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):
+        up_b.until("node", reach="started")
+        up_b.until("request", operation="configure")
+        configured_s = time.time()
+        (served_s,) = (
+            float(each.rpartition(" ")[2])
+            for each in notes.read_text().splitlines()
+            if each.startswith("driver serves ")
+        )
+        assert served_s < configured_s < served_s + 2.0
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+            up.signal(signal.SIGTERM)
         assert (up_a.finish(), up_b.finish()) == (ExitCode.OK, ExitCode.OK)
 
 

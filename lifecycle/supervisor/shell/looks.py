@@ -268,7 +268,7 @@ class Looks:
             reads = any(not each.by.kinds for each in ready.get(key, ()))
             if foreign or reads or (key in healthy and not node.reports_health):
                 keys.add(key)
-        names = frozenset(run.plan.node(key).full_name for key in keys)
+        names = frozenset(each.full_name for each in run.plan.nodes if each.key in keys)
         return names, bool(names or ready)
 
     def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:

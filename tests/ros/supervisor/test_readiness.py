@@ -173,6 +173,7 @@ def test_a_node_waits_until_a_parameter_of_a_driver_is_set(
         end(found)
 
 
+@pytest.mark.thorough
 def test_a_node_waits_for_a_driver_that_others_start(late: Late) -> None:
     attached = {key: each for key, each in late.driver("command", "").items() if key != "run"}
     manifest = late.write({**attached, "attach": True}, late.viewer("managed", BOTH))
@@ -190,6 +191,7 @@ def test_a_node_waits_for_a_driver_that_others_start(late: Late) -> None:
                 one.send_signal(signal.SIGTERM)
 
 
+@pytest.mark.thorough
 def test_one_that_comes_again_with_its_driver_waits_again(late: Late) -> None:
     again = {"restart": "on-failure", "on_failure": "dependents"}
     manifest = late.write(
