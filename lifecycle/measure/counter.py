@@ -50,7 +50,7 @@ class Counter:
     """
 
     def __init__(self, now_ns: int, wall_ns: int, *, is_apart: bool = False) -> None:
-        self._is_apart = is_apart
+        self.is_apart = is_apart
         self._shift_ns: int | None = None
         self._bucket_of = signed_bucket_of if is_apart else bucket_of
         self._lock = threading.Lock()
@@ -90,7 +90,7 @@ class Counter:
         """Count what was noted; from any thread."""
         with self._lock:
             noted = [self._noted.popleft() for _ in range(len(self._noted))]
-            if self._is_apart and self._shift_ns is None:
+            if self.is_apart and self._shift_ns is None:
                 since_ns = self._published_ns - int(WARM_UP_S * _NS)
                 new = (each for each in noted if (each[3] or each[1]) >= since_ns)
                 self._shift_ns = min((each[1] - each[2] for each in new), default=None)
@@ -137,7 +137,7 @@ class Counter:
         numbered = 0 < number < _UNNUMBERED
         before, self._last_number = self._last_number, number
         # When it was published is not known by another clock, but when it was received.
-        at_ns = (received_ns or wall_ns) if self._is_apart else source_ns
+        at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
         if at_ns < self._published_ns or now_ns < self._since_ns:
             return
         self._close_slots(now_ns)
@@ -151,7 +151,7 @@ class Counter:
             self._slot_lost += number - before - 1
         shift_ns = self._shift_ns or 0
         delay_ns = wall_ns - source_ns - shift_ns
-        if self._is_apart and not -_BELOW_NS < delay_ns < LONGEST_NS:
+        if self.is_apart and not -_BELOW_NS < delay_ns < LONGEST_NS:
             self._shift_ns = shift_ns = shift_ns + delay_ns
             delay_ns = 0
             self._all, self._used, self._received = {}, {}, {}

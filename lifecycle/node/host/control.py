@@ -54,6 +54,7 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
+    MEASURE = "measure"  # apart: count what arrives from now on, and report it
     # Not answered: the end of file that follows is orderly, not that of a killed supervisor.
     END = "end"
 
@@ -65,7 +66,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
         joins: the rest of its system runs already, and is asked to announce itself at once.
-        measures: the plan has numbers to compare with what is counted.
+        measures: what arrives is counted and reported: the plan has numbers to compare it with.
         apart: fully qualified topics whose publishers another supervisor has, on another clock.
     """
 
@@ -90,6 +91,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
         connection: name of a connection, for CONNECT_TO, MAP_TO and DISCONNECT_FROM.
         connections: what to connect to, for CONNECT_TO.
         endpoint: `publishers/video`, kind and declared name, for MAP_TO.
+        apart: as HostSpec has it, for MEASURE.
     """
 
     id: int = 0
@@ -98,6 +100,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
     endpoint: str = ""
+    apart: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return what it asks as text, as it follows "cannot"."""

@@ -18,7 +18,7 @@ import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, NoReturn
 
 import rclpy
@@ -115,6 +115,7 @@ class Host:
         self._output = _Output(spec.log)
         self._is_orderly = False
         self._left = threading.Event()
+        self._reports = False
         self._nodes: dict[str, Hosted] = {}
         self._adoption = Adoption(context, self._loop, supervisor=spec.system)
         self._marks: dict[str, tuple[int | None, ...]] = {}
@@ -197,7 +198,7 @@ class Host:
         group = [each for each in self._spec.nodes if each.run == planned.run]
         for hosted in self._adoption.make(planned, group, maker):
             self._nodes[hosted.full_name] = hosted
-            hosted.gate.apart = frozenset(self._spec.apart)
+            hosted.gate.measure(self._spec.apart if self._spec.measures else None)
             if hosted.spec.managed:
                 hosted.add_listener(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
@@ -213,6 +214,14 @@ class Host:
         if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
         if self._spec.measures:
+            self._measure(self._spec.apart)
+
+    def _measure(self, apart: Collection[str]) -> None:
+        """Count what arrives in each node from now on, and report it."""
+        for hosted in self._nodes.values():
+            hosted.gate.measure(apart)
+        if not self._reports:
+            self._reports = True
             threading.Thread(target=self._report_measured, name="measured", daemon=True).start()
 
     def _report_state(self, hosted: Hosted) -> None:
@@ -348,6 +357,8 @@ class Host:
             send_again_soon()
         elif operation is Operation.REPUBLISH_NAMES:
             self._loop.republish_names()
+        elif operation is Operation.MEASURE:
+            self._measure(command.apart)
         elif operation is Operation.CONNECT_TO:
             node.data_layer.connect_to(command.connection, command.connections)
         elif operation is Operation.MAP_TO:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import inspect
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle.measure.counter import Counter
@@ -42,14 +42,10 @@ class Gated(Protocol):
 
 
 class NodeGate:
-    """All gated entities of one node; closed until the node is active.
-
-    Attributes:
-        apart: topics that are published by another host's clock.
-    """
+    """All gated entities of one node; closed until the node is active."""
 
     def __init__(self) -> None:
-        self.apart: frozenset[str] = frozenset()
+        self._apart: frozenset[str] | None = frozenset()
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
         self._is_open = False
@@ -77,6 +73,17 @@ class NodeGate:
         self._entities.pop(id(entity), None)
         self._workers.pop(id(entity), None)
 
+    def measure(self, apart: Collection[str] | None) -> None:
+        """Count what arrives, which it does unless something else is said, or do not.
+
+        Args:
+            apart: topics that are published by another host's clock; None: nothing is counted.
+        """
+        self._apart = None if apart is None else frozenset(apart)
+        for gated in tuple(self._entities.values()):
+            if self._is_open and isinstance(gated, CountedSubscription):
+                self._open(gated)
+
     def measured(self) -> Measured | None:
         """Return what subscriptions have counted; None while it is closed. From any thread."""
         if not self._is_open:
@@ -97,7 +104,7 @@ class NodeGate:
 
     def _open(self, gated: Gated) -> None:
         if isinstance(gated, CountedSubscription):
-            gated.is_apart = gated.topic in self.apart
+            gated.is_apart = None if self._apart is None else gated.topic in self._apart
         gated.open()
 
     def close(self) -> None:
@@ -141,30 +148,36 @@ class CountedSubscription:
 
     Attributes:
         topic: fully qualified.
-        is_apart: it is published by another host's clock.
+        is_apart: it is published by another host's clock; None: it is not to be counted.
     """
 
     def __init__(self, subscription: Subscription) -> None:
         self._subscription = subscription
         self.topic = str(subscription.topic_name)
-        self.is_apart = False
+        self.is_apart: bool | None = False
+        self._is_open = False
         self._call = _taking_info(subscription.callback)
         self._counter: Counter | None = None
 
     def open(self) -> None:
-        """Count from now on."""
-        if self._counter is None:
+        """Count from now on, if it is to be counted."""
+        self._is_open = True
+        if self.is_apart is None:
+            self._counter = None
+            self._subscription.callback = self._call
+        elif self._counter is None or self._counter.is_apart is not self.is_apart:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
             self._subscription.callback = _counting(self._call, self._counter)
 
     def close(self) -> None:
         """Count no more."""
+        self._is_open = False
         self._counter = None
         self._subscription.callback = self._call
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
-        """Return the topic and what was counted; None while closed."""
+        """Return the topic and what was counted; None if nothing is."""
         counter = self._counter
         return None if counter is None else (self.topic, counter.sample(now_ns))
 
@@ -202,7 +215,7 @@ class GatedSubscription(CountedSubscription):
 
     async def _deliver(self) -> None:
         # Closed again before this ran: then what was kept stays kept.
-        while self._kept and self._counter is not None:
+        while self._kept and self._is_open:
             returned = self._call(*self._kept.popleft())
             if inspect.isawaitable(returned):
                 await returned

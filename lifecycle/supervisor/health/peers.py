@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
 from lifecycle.measure.clock import ClockComparison, ClockOffset
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
         Received,
     )
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-    from lifecycle.supervisor.processes.control_channel import ControlChannel
 
 ANNOUNCED_S = 5.0
 """A supervisor that is there has announced its plan within so long: with its first matched
@@ -314,7 +312,7 @@ class Peers:
         for each in self._system.processes.values():
             if each.channel is not None and not each.ended.done():
                 node = self._system.nodes[each.planned.nodes[0]].name
-                self._start(_ask(each.channel, Command(node=node, operation=operation)))
+                self._start(each.channel.have(Command(node=node, operation=operation)))
 
     def _start(self, doing: Coroutine[Any, Any, None]) -> None:
         task = asyncio.ensure_future(doing)
@@ -442,11 +440,6 @@ def _forget(peer: _Peer) -> None:
     if peer.watch is not None:
         peer.watch.destroy()
         peer.watch = None
-
-
-async def _ask(channel: ControlChannel, command: Command) -> None:
-    with contextlib.suppress(BringUpError):  # one that ends meanwhile has nothing to do any more
-        await channel.request(command)
 
 
 def _supervisor_of(machine: str) -> str:

@@ -139,6 +139,11 @@ class ControlChannel:
         finally:
             self._replies.pop(number, None)
 
+    async def have(self, command: Command) -> None:
+        """Have the host do something; one that ends meanwhile has nothing to do any more."""
+        with contextlib.suppress(BringUpError):
+            await self.request(command)
+
     async def drained(self, timeout_s: float) -> None:
         """Wait, bounded, for what a host that has ended wrote before."""
         if self._task is not None:

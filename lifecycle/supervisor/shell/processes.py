@@ -14,7 +14,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
-from lifecycle.node.host.control import HostSpec
+from lifecycle.node.host.control import Command, HostSpec, Operation
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import effects, inputs
@@ -81,12 +81,7 @@ class Processes:
                 log=process.log.shown,
                 joins=system.run.held_s is not None,
                 measures=bool(system.plan.bounds),
-                apart=tuple(
-                    each.topic
-                    for each in system.plan.flows
-                    if each.publisher in system.remote
-                    and each.subscription in process.planned.nodes
-                ),
+                apart=self._apart(process),
             )
             channel = ControlChannel(spec, system.on_host_event, hung)
         try:
@@ -103,6 +98,27 @@ class Processes:
             inputs.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
         )
         self._means.records.write()
+
+    def _apart(self, process: ManagedProcess) -> tuple[str, ...]:
+        """Return the topics whose messages come by the clock of another host."""
+        nodes, remote = process.planned.nodes, self._system.remote
+        return tuple(
+            each.topic
+            for each in self._system.plan.flows
+            if each.publisher in remote and each.subscription in nodes
+        )
+
+    def measure(self) -> None:
+        """Have hosts count what the plan that is now in force has numbers of."""
+        if not self._system.plan.bounds:
+            return
+        for process in self._system.processes.values():
+            if process.channel is not None and not process.ended.done():
+                node = self._system.nodes[process.planned.nodes[0]].name
+                measure = Command(
+                    node=node, operation=Operation.MEASURE, apart=self._apart(process)
+                )
+                self._shell.start(process.channel.have(measure))
 
     def _ended(self, process: ManagedProcess) -> None:
         """Say how a process ended; of one that was starting, once all is read that it said."""

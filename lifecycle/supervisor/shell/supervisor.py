@@ -408,6 +408,8 @@ class Supervisor:
         self._plans, again, self.again = (run.plan, run.first), frozenset(self.again), set()
         if run.plan is not plan:
             self.system.expected = run.plan
+            if (run.plan.bounds, run.plan.flows) != (plan.bounds, plan.flows):
+                self._processes.measure()
             self._wake_looks()  # others may be waited for, or for something else
         if self.authority is not None:
             self.authority.replan(run.plan, again)
