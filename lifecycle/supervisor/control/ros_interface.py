@@ -263,9 +263,9 @@ def _of_flow(
             level, message = WARN, f"{message}, the system is {status.phase}"
         return level, name, message, label[1], ()
     # Numbers are values, so that who shows each new message is not shown one each second.
-    level, message = OK, measured.outcome
+    message = measured.outcome
+    level = {"violated": ERROR, "unverifiable": WARN}.get(message, OK)
     if measured.violated:
-        level = ERROR
         message += f": {', '.join(dict.fromkeys(each.name for each in measured.violated))}"
     bounds = ((each.name, each.text) for each in measured.bounds)
     return level, name, message, label[1], (*measured.numbers().items(), *bounds)

@@ -214,9 +214,9 @@ def test_a_flow_with_declared_numbers_has_an_entry_that_stays_while_it_is_not_me
     assert shown("active", Outcome.OK, late) == [
         (ERROR, name, "violated: max_delay_ms", "us", values)
     ]
-    for outcome in ("measuring", "ok"):
+    for outcome, level in (("measuring", OK), ("ok", OK), ("unverifiable", WARN)):
         (entry,) = shown("measuring", Outcome.OK, measured(outcome, "delay"))
-        assert entry[:3] == (OK, name, outcome)
+        assert entry[:3] == (level, name, outcome)
     assert [each[:3] for each in shown("paused", Outcome.OK)] == [
         (WARN, name, "not measured, the system is paused")
     ]
