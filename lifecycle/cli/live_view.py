@@ -17,6 +17,7 @@ from rich.live import Live as RichLive
 from rich.table import Table
 from rich.text import Text
 
+from lifecycle.cli.common import wrapped
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
 from lifecycle.cli.verbs.control import HEADS, row
@@ -158,18 +159,16 @@ class Live:
         for column in HEADS:
             # Where there is no room the others keep theirs; no row takes two lines.
             table.add_column(column, no_wrap=column not in ("node", ""))
-        measured = measured_summary(status.measured)
-        rows = self._console.height - _AROUND_ROWS - bool(measured)
-        shown = _that_fit(status.nodes, rows)
+        measured = one_line(measured_summary(status.measured))
+        lines = wrapped([measured] if measured else [], self._console.width).splitlines()
+        shown = _that_fit(status.nodes, self._console.height - _AROUND_ROWS - len(lines))
         for node in shown:
             table.add_row(*_row(node))
         parts: list[RenderableType] = [_head(status), table]
         if left := len(status.nodes) - len(shown):
             parts.append(Text(f"… {left} more nodes: lifecycle status {status.system} --watch"))
-        if measured:
-            violated = any(each.violated for each in status.measured)
-            style = "red" if violated else "dim"
-            parts.append(Text(one_line(measured), style=style, overflow="ellipsis", no_wrap=True))
+        violated = any(each.violated for each in status.measured)
+        parts += [Text(line, style="red" if violated else "dim", no_wrap=True) for line in lines]
         style = "white" if status.verdict is None else _OUTCOMES[status.verdict]
         parts.append(Text(self._verdict, style=style, overflow="ellipsis", no_wrap=True))
         return Group(*parts)

@@ -1,7 +1,7 @@
 """What was measured of flows, for people and spreadsheets: cells with small bars, rows of a record.
 
 Owns: how a number and its bound look in a table, with `!` for a bound that is not kept and `?` for
-one that is not decided yet, so that no colour is needed to read it; and the file that
+one that is not decided, so that no colour is needed to read it; and the file that
 `lifecycle flows --record` writes.
 """
 
@@ -18,7 +18,12 @@ from lifecycle.errors import UsageError
 from lifecycle.measure.bounds import Kind
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement
 
-_MARKS = {"violated": ("!", "\x1b[31m"), "measuring": ("?", "\x1b[33m"), "ok": (" ", "")}
+_MARKS = {
+    "violated": ("!", "\x1b[31m"),
+    "unverifiable": ("?", "\x1b[33m"),
+    "measuring": ("?", "\x1b[33m"),
+    "ok": (" ", ""),
+}
 """Of an outcome, the worst first: what follows the number, and the colour of the cell."""
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"

@@ -136,7 +136,10 @@ def _short_names(flows: Sequence[FlowReport]) -> dict[str, str]:
 
 def _outcome(flow: FlowReport, measured: FlowMeasurement | None) -> Outcome:
     """Return how a flow is, with what has arrived of it."""
-    return Outcome.VIOLATED if measured is not None and measured.violated else flow.outcome
+    found = [flow.outcome]
+    if measured is not None and measured.outcome in ("violated", "unverifiable"):
+        found.append(Outcome(measured.outcome))
+    return Outcome.worst(found)
 
 
 def _rows(
@@ -222,7 +225,7 @@ def command() -> None:
 
     One line per network flow: rate, delay and loss as far as they are measured, its 5-tuple, on
     IPv6 its flow label, DSCP and TOS byte, how unique it is, what was required and the verdict.
-    Beside a number is how much of its declared bound it is; `!` is not kept, `?` not decided yet.
+    Beside a number is how much of its declared bound it is; `!` is not kept, `?` not decided.
     Exits as `lifecycle verify` does.
     """
 

@@ -262,8 +262,11 @@ def _of_flow(
         if level == OK and status.phase not in _DONE:
             level, message = WARN, f"{message}, the system is {status.phase}"
         return level, name, message, label[1], ()
-    level = ERROR if measured.violated else OK
-    message = ", ".join(each.text for each in measured.bounds)
+    # Numbers are values, so that who shows each new message is not shown one each second.
+    message = measured.outcome
+    level = {"violated": ERROR, "unverifiable": WARN}.get(message, OK)
+    if measured.violated:
+        message += f": {', '.join(dict.fromkeys(each.name for each in measured.violated))}"
     bounds = ((each.name, each.text) for each in measured.bounds)
     return level, name, message, label[1], (*measured.numbers().items(), *bounds)
 

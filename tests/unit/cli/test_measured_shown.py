@@ -43,6 +43,7 @@ def measured(*bounds: MeasuredBound, topic: str = "/robot/video", to: str = "/op
 LATE = bound(Kind.DELAY, "violated", 11.648, "delay p99 58.2 ms > 5 ms")
 IN_TIME = bound(Kind.DELAY, "ok", 0.5, "delay p99 58.2 ms ≤ 116 ms")
 SLOW = bound(Kind.RATE, "violated", 0.5, "14.8 Hz < 30 Hz - 5%")
+UNSURE = bound(Kind.NETWORK_DELAY, "unverifiable", 0.97)
 LOSES = bound(Kind.LOSS, "measuring", 0.013, "1 of 75 lost, measuring ≤ 1")
 
 
@@ -67,6 +68,7 @@ def test_a_bar_is_as_long_as_its_share_and_never_longer_than_its_column(
             measured(IN_TIME, replace(LATE, kind=Kind.NETWORK_DELAY)),
             ("14.8", "0.42", "58.2!███", "1/75"),
         ),
+        (measured(IN_TIME, UNSURE), ("14.8", "0.42", "58.2?██▉", "1/75")),
         (measured(bound(Kind.DELAY, "measuring", None)), ("14.8", "0.42", "58.2?", "1/75")),
         (replace(measured(), lost=None, p50_ms=None, p99_ms=1234.5), ("14.8", "–", "1234", "–")),
     ],
