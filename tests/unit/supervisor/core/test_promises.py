@@ -90,7 +90,7 @@ MUTANTS = [
 ]
 """The promise that is broken, the module, what it has, and what the mutant has instead."""
 
-ENOUGH = 1500
+ENOUGH = 4000
 """Stories after which a mutant counts as not noticed."""
 
 REAL = Core()
