@@ -1,4 +1,4 @@
-"""Counts what arrives at one subscription: constant memory, about a microsecond a message.
+"""Counts what arrives at one subscription: constant memory, some microseconds a message.
 
 Owns: what is noted as a message arrives, the slots in which it is counted later, in another thread,
 and for how long they are kept. What is noted costs the callback's thread as little as possible. The
@@ -8,10 +8,11 @@ clock is the caller's.
 from __future__ import annotations
 
 import threading
+from collections import Counter as Counts
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from lifecycle.measure.delays import LONGEST_NS, Delays, bucket_of, signed_bucket_of
+from lifecycle.measure.delays import LONGEST_NS, Delays, buckets_of, signed_buckets_of
 from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Sample, Slot
 
 WARM_UP_S = 0.5
@@ -23,7 +24,7 @@ _EACH_LEVEL = 6
 _LEVELS = 14
 """The oldest slots are those of half a second times 2**13: more than an hour each."""
 
-_MOST_NOTED = 4096
+_MOST_NOTED = 64
 """More messages than this are counted at once, in the callback's thread."""
 
 _UNNUMBERED = 1 << 63
@@ -34,8 +35,9 @@ _BELOW_NS = 1 << 26
 their buckets would be larger than a millisecond."""
 
 _NS = 1e9
+_SLOT_NS = int(SLOT_S * _NS)
 
-_Noted = tuple[int, int, int, int, int]
+_Noted = tuple[int, int, Mapping[str, int]]
 
 
 class Counter:
@@ -52,12 +54,12 @@ class Counter:
     def __init__(self, now_ns: int, wall_ns: int, *, is_apart: bool = False) -> None:
         self.is_apart = is_apart
         self._shift_ns: int | None = None
-        self._bucket_of = signed_bucket_of if is_apart else bucket_of
+        self._buckets_of = signed_buckets_of if is_apart else buckets_of
         self._lock = threading.Lock()
         self._noted: deque[_Noted] = deque()
         self._published_ns = wall_ns + int(WARM_UP_S * _NS)
         self._last_number = 0
-        self._all: dict[int, int] = {}
+        self._all: Counts[int] = Counts()
         self._since_ns = self._slot_ns = self._last_ns = now_ns + int(WARM_UP_S * _NS)
         self._messages = 0
         self._lost: int | None = 0
@@ -69,33 +71,19 @@ class Counter:
 
     def _open(self) -> None:
         self._slot_messages = self._slot_lost = 0
-        self._used: dict[int, int] = {}
-        self._received: dict[int, int] = {}
+        self._used: Counts[int] = Counts()
+        self._received: Counts[int] = Counts()
 
     def arrived(self, now_ns: int, wall_ns: int, info: Mapping[str, int]) -> None:
         """Note a message, at the start of its callback, with its rmw_message_info_t."""
-        self._noted.append(
-            (
-                now_ns,
-                wall_ns,
-                info["source_timestamp"],
-                info["received_timestamp"],
-                info["publication_sequence_number"],
-            )
-        )
+        self._noted.append((now_ns, wall_ns, info))
         if len(self._noted) > _MOST_NOTED:
             self.count()
 
     def count(self) -> None:
         """Count what was noted; from any thread."""
         with self._lock:
-            noted = [self._noted.popleft() for _ in range(len(self._noted))]
-            if self.is_apart and self._shift_ns is None:
-                since_ns = self._published_ns - int(WARM_UP_S * _NS)
-                new = (each for each in noted if (each[3] or each[1]) >= since_ns)
-                self._shift_ns = min((each[1] - each[2] for each in new), default=None)
-            for each in noted:
-                self._count(*each)
+            self._count([self._noted.popleft() for _ in range(len(self._noted))])
 
     def sample(self, now_ns: int) -> Sample:
         """Count what was noted, and return what is known now; from any thread."""
@@ -131,42 +119,62 @@ class Counter:
             Delays.of((each[1] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
         )
 
-    def _count(
-        self, now_ns: int, wall_ns: int, source_ns: int, received_ns: int, number: int
-    ) -> None:
-        numbered = 0 < number < _UNNUMBERED
-        before, self._last_number = self._last_number, number
-        # When it was published is not known by another clock, but when it was received.
-        at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
-        if at_ns < self._published_ns or now_ns < self._since_ns:
-            return
-        self._close_slots(now_ns)
-        self._last_ns = now_ns
-        self._messages += 1
-        self._slot_messages += 1
-        if not numbered:
+    def _count(self, noted: Iterable[_Noted]) -> None:
+        used, received = list[int](), list[int]()
+        last, last_ns = self._last_number, self._last_ns
+        for now_ns, wall_ns, info in noted:
+            source_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
+            before, last = last, info["publication_sequence_number"]
+            # When it was published is not known by another clock, but when it was received.
+            at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
+            if at_ns < self._published_ns or now_ns < self._since_ns:
+                continue
+            if now_ns >= self._slot_ns + _SLOT_NS:
+                self._add(used, received)
+                used, received = [], []
+                self._close_slots(now_ns)
+            if last != before + 1:
+                self._skip(before, last)
+            used.append(wall_ns - source_ns)
+            if received_ns > 0:
+                received.append(received_ns - source_ns)
+            last_ns = now_ns
+        self._last_number, self._last_ns = last, last_ns
+        self._add(used, received)
+
+    def _skip(self, before: int, number: int) -> None:
+        if not 0 < number < _UNNUMBERED:
             self._lost = None
         elif 0 < before < number and self._lost is not None:  # else its publisher is a new one
             self._lost += number - before - 1
             self._slot_lost += number - before - 1
-        shift_ns = self._shift_ns or 0
-        delay_ns = wall_ns - source_ns - shift_ns
-        if self.is_apart and not -_BELOW_NS < delay_ns < LONGEST_NS:
-            self._shift_ns = shift_ns = shift_ns + delay_ns
-            delay_ns = 0
-            self._all, self._used, self._received = {}, {}, {}
+
+    def _add(self, used: list[int], received: list[int]) -> None:
+        if not used:
+            return
+        self._messages += len(used)
+        self._slot_messages += len(used)
+        if self.is_apart:
+            used, received = self._shifted(used, received)
+        buckets = self._buckets_of(used)
+        self._used.update(buckets)
+        self._all.update(buckets)
+        self._received.update(self._buckets_of(received))
+
+    def _shifted(self, used: list[int], received: list[int]) -> tuple[list[int], list[int]]:
+        """Return by how much delays are longer than a short one."""
+        least = min(used)
+        shift = least if self._shift_ns is None else self._shift_ns
+        if not (least - shift > -_BELOW_NS and max(used) - shift < LONGEST_NS):
+            shift = least
+            self._all, self._used, self._received = Counts(), Counts(), Counts()
             self._delays.clear()
-        bucket_of = self._bucket_of
-        bucket = bucket_of(delay_ns)
-        self._used[bucket] = self._used.get(bucket, 0) + 1
-        self._all[bucket] = self._all.get(bucket, 0) + 1
-        if received_ns > 0:
-            bucket = bucket_of(received_ns - source_ns - shift_ns)
-            self._received[bucket] = self._received.get(bucket, 0) + 1
+        self._shift_ns = shift
+        return [each - shift for each in used], [each - shift for each in received]
 
     def _close_slots(self, now_ns: int) -> None:
-        while now_ns - self._slot_ns >= SLOT_S * _NS:
-            self._slot_ns += int(SLOT_S * _NS)
+        while now_ns - self._slot_ns >= _SLOT_NS:
+            self._slot_ns += _SLOT_NS
             self._delays.append((self._used, self._received))
             self._keep(Slot(seconds=SLOT_S, messages=self._slot_messages, lost=self._slot_lost))
             self._open()

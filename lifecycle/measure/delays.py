@@ -26,18 +26,23 @@ ERROR = 1 / _PARTS
 _NS_PER_MS = 1e6
 
 
-def signed_bucket_of(delay_ns: int) -> int:
-    """Return the bucket of a difference of two delays, which may be negative."""
-    return bucket_of(delay_ns) if delay_ns >= 0 else -bucket_of(-delay_ns)
+def buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of delays; what seems to arrive before it was sent counts as 0 ns."""
+    return [
+        ((shift := each.bit_length() - _PART_BITS - 1) << _PART_BITS) + (each >> shift)
+        if each >= _PARTS
+        else max(each, 0)
+        for each in delays_ns
+    ]
 
 
-def bucket_of(delay_ns: int) -> int:
-    """Return the bucket of a delay; what seems to arrive before it was sent counts as 0 ns."""
-    if delay_ns < _PARTS:
-        return max(delay_ns, 0)
-    delay_ns = min(delay_ns, LONGEST_NS)
-    shift = delay_ns.bit_length() - _PART_BITS - 1
-    return (shift << _PART_BITS) + (delay_ns >> shift)
+def signed_buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of differences of two delays, which may be negative."""
+    return [
+        bucket if each >= 0 else -bucket
+        for each in delays_ns
+        for bucket in buckets_of((abs(each),))
+    ]
 
 
 def least_ns(bucket: int) -> int:
@@ -50,7 +55,7 @@ def least_ns(bucket: int) -> int:
     return (bucket - (shift << _PART_BITS)) << shift
 
 
-LAST_BUCKET = bucket_of(LONGEST_NS)
+(LAST_BUCKET,) = buckets_of((LONGEST_NS,))
 
 Bucket = Annotated[int, msgspec.Meta(ge=-LAST_BUCKET, le=LAST_BUCKET)]
 
@@ -81,7 +86,8 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
         """Add up histograms, each the number of delays by bucket."""
         total: dict[int, int] = {}
         for each in counts:
-            for bucket, number in each.items():
+            for found, number in each.items():
+                bucket = max(-LAST_BUCKET, min(found, LAST_BUCKET))
                 total[bucket] = total.get(bucket, 0) + number
         return cls(seconds=seconds, buckets=tuple(sorted(total.items())), shift_ns=shift_ns)
 

@@ -161,7 +161,7 @@ def status_command(
     with asking(path):
         seen = status(path)
     if probe is not None:
-        ready = seen.phase == "active" and seen.verdict is not Outcome.VIOLATED
+        ready = seen.phase in ("measuring", "active") and seen.verdict is not Outcome.VIOLATED
         return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
     if format_ == "json":
         click.echo(json_text(to_json(seen).decode()))

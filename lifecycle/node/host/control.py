@@ -54,7 +54,7 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    MEASURE = "measure"  # apart: count what arrives from now on, and report it
+    MEASURE = "measure"  # apart: report what is counted from now on
     # Not answered: the end of file that follows is orderly, not that of a killed supervisor.
     END = "end"
 
@@ -66,7 +66,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
         joins: the rest of its system runs already, and is asked to announce itself at once.
-        measures: what arrives is counted and reported: the plan has numbers to compare it with.
+        measures: what is counted is reported: the plan has numbers to compare it with.
         apart: fully qualified topics whose publishers another supervisor has, on another clock.
     """
 

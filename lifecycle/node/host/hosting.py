@@ -198,7 +198,7 @@ class Host:
         group = [each for each in self._spec.nodes if each.run == planned.run]
         for hosted in self._adoption.make(planned, group, maker):
             self._nodes[hosted.full_name] = hosted
-            hosted.gate.measure(self._spec.apart if self._spec.measures else None)
+            hosted.gate.measure(self._spec.apart)
             if hosted.spec.managed:
                 hosted.add_listener(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)

@@ -45,7 +45,7 @@ class NodeGate:
     """All gated entities of one node; closed until the node is active."""
 
     def __init__(self) -> None:
-        self._apart: frozenset[str] | None = frozenset()
+        self._apart: frozenset[str] = frozenset()
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
         self._is_open = False
@@ -73,13 +73,13 @@ class NodeGate:
         self._entities.pop(id(entity), None)
         self._workers.pop(id(entity), None)
 
-    def measure(self, apart: Collection[str] | None) -> None:
-        """Count what arrives, which it does unless something else is said, or do not.
+    def measure(self, apart: Collection[str]) -> None:
+        """Count what arrives from now on by these clocks.
 
         Args:
-            apart: topics that are published by another host's clock; None: nothing is counted.
+            apart: topics that are published by another host's clock.
         """
-        self._apart = None if apart is None else frozenset(apart)
+        self._apart = frozenset(apart)
         for gated in tuple(self._entities.values()):
             if self._is_open and isinstance(gated, CountedSubscription):
                 self._open(gated)
@@ -104,7 +104,7 @@ class NodeGate:
 
     def _open(self, gated: Gated) -> None:
         if isinstance(gated, CountedSubscription):
-            gated.is_apart = None if self._apart is None else gated.topic in self._apart
+            gated.is_apart = gated.topic in self._apart
         gated.open()
 
     def close(self) -> None:
@@ -148,27 +148,24 @@ class CountedSubscription:
 
     Attributes:
         topic: fully qualified.
-        is_apart: it is published by another host's clock; None: it is not to be counted.
+        is_apart: it is published by another host's clock.
     """
 
     def __init__(self, subscription: Subscription) -> None:
         self._subscription = subscription
         self.topic = str(subscription.topic_name)
-        self.is_apart: bool | None = False
+        self.is_apart = False
         self._is_open = False
         self._call = _taking_info(subscription.callback)
         self._counter: Counter | None = None
 
     def open(self) -> None:
-        """Count from now on, if it is to be counted."""
+        """Count from now on."""
         self._is_open = True
-        if self.is_apart is None:
-            self._counter = None
-            self._subscription.callback = self._call
-        elif self._counter is None or self._counter.is_apart is not self.is_apart:
+        if self._counter is None or self._counter.is_apart is not self.is_apart:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
-            self._subscription.callback = _counting(self._call, self._counter)
+            self._subscription.callback = counting(self._call, self._counter)
 
     def close(self) -> None:
         """Count no more."""
@@ -234,7 +231,7 @@ def _taking_info(callback: Callable[..., Any]) -> Callable[[Any, Info], Any]:
     return lambda message, _: callback(message)
 
 
-def _counting(call: Callable[[Any, Info], Any], counter: Counter) -> Callable[[Any, Info], Any]:
+def counting(call: Callable[[Any, Info], Any], counter: Counter) -> Callable[[Any, Info], Any]:
     """Return a callback that notes each message before the user's is called."""
     arrived, now_ns, wall_ns = counter.arrived, time.monotonic_ns, time.time_ns
     if inspect.iscoroutinefunction(call):

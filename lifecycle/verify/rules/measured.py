@@ -142,7 +142,6 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     Attributes:
         sample: what its subscription has counted; None where it is judged by another supervisor or
             cannot count.
-        uncounted: its subscription could count, and does not.
         several: how many publishers its subscription has.
         has_clocks: both ends are on one host, or a supervisor on each compares its clock.
         clock: what is known of the clocks of all who publish to the subscription; None if one is
@@ -153,7 +152,6 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     flow: FlowView
     sample: Sample | None
-    uncounted: bool
     several: int
     has_clocks: bool
     clock: ClockOffset | None
@@ -178,8 +176,6 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             yield "128 to 254 are an operator's own classes"
         if not self.flow.nodes[1].is_ours and not self.flow.planned.measure:
             yield f"{self.flow.subscription} does not run in our host"
-        if self.uncounted:
-            yield f"{self.flow.subscription} counts nothing: it was started without any such number"
         if kinds & _DELAYS and not self.has_clocks:
             yield "the clocks of the two hosts are not compared"
         one_publishers = kinds - _DELAYS
@@ -371,7 +367,6 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                uncounted=_is_uncounted(flow),
                 several=max(planned, *matched, 1),
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
@@ -446,15 +441,6 @@ def _sample(view: View, flow: FlowView) -> Sample | None:
     measured = configuration.measured
     found = None if measured is None else measured.of(flow.planned.topic)
     return found or Sample(seconds=0.0)  # it has not reported yet
-
-
-def _is_uncounted(flow: FlowView) -> bool:
-    """Return whether the node that subscribes reports for a while that it counts nothing of it."""
-    report = flow.nodes[1].configuration
-    measured = None if report is None else report.measured
-    if measured is None or flow.planned.measure or measured.active_s < DELAY_S:
-        return False
-    return measured.of(flow.planned.topic) is None
 
 
 def _is_active(view: View, flow: FlowView) -> bool:

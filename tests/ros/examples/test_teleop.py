@@ -84,9 +84,16 @@ def test_the_operators_stop_reaches_the_base(run: tuple[Events, dict[str, object
 def test_the_flows_are_what_the_manifest_asks_for(run: tuple[Events, dict[str, object]]) -> None:
     verdict = run[0][-1]
     findings = verdict["findings"]
-    assert {each["rule"] for each in findings} == {"flow.not-measured"}  # type: ignore[attr-defined]
-    trusted = verdict["run"]["trusted"]  # type: ignore[index]
-    assert trusted.startswith("five_qi 85 of /robot/cmd_vel, max_delay_ms 5 of /robot/video")
+    # A machine that is busy with other tests may be late.
+    assert {each["rule"] for each in findings} <= {"flow.delay"}  # type: ignore[attr-defined]
+    assert "trusted" not in verdict["run"]  # type: ignore[operator]
+    numbers = {
+        (each["topic"], bound["name"])
+        for each in verdict["measured"]  # type: ignore[attr-defined]
+        for bound in each["bounds"]
+    }
+    delayed = {(f"/robot/{topic}", "max_delay_ms") for topic in ("video", "battery", "cmd_vel")}
+    assert numbers == {*delayed, ("/robot/cmd_vel", "five_qi")}
     flows = {
         (flow["topic"], flow["publisher"], flow["subscription"]): flow
         for flow in verdict["flows"]  # type: ignore[attr-defined]

@@ -438,7 +438,18 @@ FLOWS = (
     ),
     Fault(
         name="nobody measures the rate that the manifest declares and the gate is strict",
-        edits={f"{TALKER}/flows": {"publishers": {"chatter": {"rate_hz": 500}}}},
+        edits={
+            f"{TALKER}/flows": {"publishers": {"chatter": {"rate_hz": 500}}},
+            f"{LISTENER}/run": {
+                "command": foreign(
+                    *("listener", "--subscribe", "/chatter:std_msgs/msg/String:RELIABLE")
+                )
+            },
+            f"{LISTENER}/managed": False,
+            f"{LISTENER}/interface": {
+                "subscriptions": [{"name": "/chatter", "type": "std_msgs/msg/String"}]
+            },
+        },
         exit_code=ExitCode.UNVERIFIABLE,
         rule="flow.not-measured",
         subject="/chatter",
@@ -448,6 +459,16 @@ FLOWS = (
 )
 
 ACTIVE = (
+    Fault(
+        name="data arrive less often than the manifest says",
+        edits={f"{TALKER}/flows": {"publishers": {"chatter": {"rate_hz": 500}}}},
+        exit_code=ExitCode.VIOLATED,
+        rule="flow.rate",
+        subject="/chatter: /talker → /listener",
+        message=" Hz < 500 Hz - 5%",
+        options=("--stop-after", "2"),
+        activates=True,
+    ),
     Fault(
         name="a process dies after the system is active",
         quick=True,

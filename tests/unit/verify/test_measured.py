@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Quantity, Run, RunKind
-from lifecycle.measure.delays import Delays, bucket_of
+from lifecycle.measure.delays import Delays, buckets_of
 from lifecycle.measure.sample import Measured, Sample, Slot
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import Observation
@@ -42,7 +42,7 @@ def pair(*of_link: Quantity, run: Run | None = None, **ends: tuple[Quantity, ...
 def arrived(
     messages: int, seconds: float, *, delay_ms: float = 1.0, lost: int = 0, silent_s: float = 0.0
 ) -> Sample:
-    histogram = {bucket_of(round(delay_ms * 1e6)): messages} if messages else {}
+    histogram = {buckets_of((round(delay_ms * 1e6),))[0]: messages} if messages else {}
     delays = Delays.of((histogram,), seconds=min(seconds, 5.0))
     slot = Slot(seconds=seconds, messages=messages, lost=lost)
     return Sample(
