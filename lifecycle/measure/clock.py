@@ -9,24 +9,17 @@ is what each of them allows (RFC 5905 §11.2.1), however asymmetric their ways a
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 import msgspec
 
 from lifecycle.measure.sample import DELAY_S
-
-KEPT = 8
-"""Exchanges that are kept, as in NTP's clock filter (RFC 5905 §10)."""
 
 _DRIFT = 10_000
 """Two clocks drift apart by one part of so many, 100 ppm, at most. RFC 5905 §7.2 allows 15 ppm for
 one clock; the quartz of one that nothing disciplines is off by up to 50 ppm."""
 
 _JUDGED_NS = round(DELAY_S * 1e9)
-
-_Exchange = tuple[int, int, int, int]
-"""When it began and ended on our clock, and between what the offset was meanwhile."""
 
 
 class ClockOffset(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,10 +49,15 @@ SAME_CLOCK = ClockOffset()
 
 
 class ClockComparison:
-    """Compares the clock of one other host with ours, in constant memory."""
+    """Compares the clock of one other host with ours, in constant memory.
+
+    What the best exchanges have proven is kept, ever wider as clocks drift: messages that queue,
+    once data congest the network, prove little.
+    """
 
     def __init__(self) -> None:
-        self._exchanges: deque[_Exchange] = deque(maxlen=KEPT)
+        self._low_ns = self._high_ns = 0
+        self._at_ns: int | None = None  # when the offset was between these
         self._set_ns: int | None = None
 
     def add(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
@@ -73,33 +71,32 @@ class ClockComparison:
             t3_ns: later the other sent one, on its clock, ...
             t4_ns: ... and it was received, on ours.
         """
-        exchange = (t1_ns, t4_ns, t3_ns - t4_ns, t2_ns - t1_ns)
-        if t4_ns < t1_ns or _within([exchange], t4_ns) is None:
+        # It was so at some time between.
+        drift = _drift_ns(t4_ns - t1_ns)
+        low, high = t3_ns - t4_ns - drift, t2_ns - t1_ns + drift
+        if t4_ns < t1_ns or low > high:
             return  # a clock was set in the middle of it
-        self._exchanges.append(exchange)
-        if _within(self._exchanges, t4_ns) is None:
-            self._exchanges.clear()
-            self._exchanges.append(exchange)
-            self._set_ns = t4_ns
+        if self._at_ns is not None:
+            drift = _drift_ns(t4_ns - self._at_ns)
+            best = max(low, self._low_ns - drift), min(high, self._high_ns + drift)
+            if best[0] <= best[1]:
+                low, high = best
+            else:
+                self._set_ns = t4_ns
+        self._low_ns, self._high_ns, self._at_ns = low, high, t4_ns
 
     def offset(self, now_ns: int) -> ClockOffset | None:
         """Return the offset of delays that are judged at a time of our clock, and so at that time.
 
         None before the first exchange, and while some of these may be from before a clock was set.
         """
-        if self._set_ns is not None and abs(now_ns - self._set_ns) < _JUDGED_NS:
+        is_new = self._set_ns is not None and abs(now_ns - self._set_ns) < _JUDGED_NS
+        if self._at_ns is None or is_new:
             return None
-        now = _within(self._exchanges, now_ns)
-        before = _within(self._exchanges, now_ns - _JUDGED_NS)
-        return None if now is None or before is None else ClockOffset.any_of((now, before))
+        drift = max(_drift_ns(each - self._at_ns) for each in (now_ns, now_ns - _JUDGED_NS))
+        low, high = self._low_ns - drift, self._high_ns + drift
+        return ClockOffset(offset_ms=(low + high) / 2e6, uncertainty_ms=(high - low + 1) / 2e6)
 
 
-def _within(exchanges: Collection[_Exchange], now_ns: int) -> ClockOffset | None:
-    """Return what all exchanges allow at a time; None if that is nothing, or there are none."""
-    # What each says was so at some time between its begin and its end.
-    drifts = [max(abs(now_ns - t1), abs(now_ns - t4)) // _DRIFT + 1 for t1, t4, _, _ in exchanges]
-    least = (low - drift for (_, _, low, _), drift in zip(exchanges, drifts, strict=True))
-    most = (high + drift for (_, _, _, high), drift in zip(exchanges, drifts, strict=True))
-    if not exchanges or (low := max(least)) > (high := min(most)):
-        return None
-    return ClockOffset(offset_ms=(low + high) / 2e6, uncertainty_ms=(high - low + 1) / 2e6)
+def _drift_ns(duration_ns: int) -> int:
+    return abs(duration_ns) // _DRIFT + 1
