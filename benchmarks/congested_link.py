@@ -60,12 +60,14 @@ class Case:
         publishers: flow needs of N1.
         subscriptions: flow needs of N2.
         apply: options of `lifecycle flows apply --target tc`; None for a link without a rule.
+        links: what the manifest declares of the two flows.
     """
 
     title: str
     publishers: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     subscriptions: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     apply: Sequence[str] | None = ()
+    links: Sequence[Mapping[str, Any]] = ()
 
 
 _FIRST = {"five_qi": 85}
@@ -201,10 +203,34 @@ def measure(
     """Bring the system up on both hosts, program the router, load the link and look at P1."""
     directory.mkdir()
     manifest = write_manifest(case, left.ipv4, right.ipv4, directory)
-    bulk_per_s = _bulk_per_s()
+    with (
+        brought_up(manifest, left, right, directory) as (one, other),
+        rule(case, router, manifest, directory),
+    ):
+        (directory / "go").touch()
+        time.sleep(FILL_S)  # the load itself is what is waited for
+        began_ns = time.monotonic_ns()
+        time.sleep(seconds)
+        ended_ns = time.monotonic_ns()
+        time.sleep(2 * BUFFER_S)  # what is on its way may still arrive
+        for running in (one, other):
+            running.send_signal(signal.SIGTERM)
+        for running in (one, other):
+            running.wait(UP_S)
+    sent = [each for each in _read(directory, "sent") if began_ns <= each <= ended_ns]
+    arrived = {stamp: at - stamp for stamp, at in _read(directory, "received")["p1"]}
+    delays = tuple(arrived[stamp] / 1e9 for stamp in sent if stamp in arrived)
+    return Result(sent=len(sent), delays_s=delays)
+
+
+@contextlib.contextmanager
+def brought_up(
+    manifest: Path, left: Host, right: Host, directory: Path
+) -> Iterator[tuple[Any, Any]]:
+    """Run a supervisor on each host, until the system is active on both."""
     variables = {
         "CONGESTED_LINK_DIRECTORY": str(directory),
-        "CONGESTED_LINK_BULK_PER_S": str(bulk_per_s),
+        "CONGESTED_LINK_BULK_PER_S": str(_bulk_per_s()),
     }
     with (
         up(left, manifest, "a", directory, {**variables, "ROS_STATIC_PEERS": right.ipv4}) as one,
@@ -212,21 +238,7 @@ def measure(
     ):
         for running in (one, other):
             until_active(running, directory)
-        with rule(case, router, manifest, directory):
-            (directory / "go").touch()
-            time.sleep(FILL_S)  # the load itself is what is waited for
-            began_ns = time.monotonic_ns()
-            time.sleep(seconds)
-            ended_ns = time.monotonic_ns()
-            time.sleep(2 * BUFFER_S)  # what is on its way may still arrive
-            for running in (one, other):
-                running.send_signal(signal.SIGTERM)
-            for running in (one, other):
-                running.wait(UP_S)
-    sent = [each for each in _read(directory, "sent") if began_ns <= each <= ended_ns]
-    arrived = {stamp: at - stamp for stamp, at in _read(directory, "received")["p1"]}
-    delays = tuple(arrived[stamp] / 1e9 for stamp in sent if stamp in arrived)
-    return Result(sent=len(sent), delays_s=delays)
+        yield one, other
 
 
 def _bulk_per_s() -> float:
@@ -264,6 +276,7 @@ def write_manifest(case: Case, left: str, right: str, directory: Path) -> Path:
                 "flows": {"subscriptions": {key: dict(v) for key, v in case.subscriptions.items()}},
             },
         },
+        "links": [dict(each) for each in case.links],
     }
     path = directory / "congested.lifecycle.yaml"
     # Without aliases: a manifest may have few.
@@ -307,6 +320,7 @@ def until_active(running: Any, directory: Path) -> None:
 def rule(case: Case, router: Host, manifest: Path, directory: Path) -> Iterator[None]:
     """Have the link, with the rules that the product makes for it or without any."""
     if case.apply is None:
+        # One class: what is queued is treated alike.
         rate = f"rate {LINK_KBIT}kbit ceil {LINK_KBIT}kbit quantum {2 * FRAME_BYTES}"
         run_tc(router, "qdisc add dev right root handle 1: htb default 1")
         run_tc(router, f"class add dev right parent 1: classid 1:1 htb {rate}")
