@@ -46,6 +46,7 @@ class NodeGate:
 
     def __init__(self) -> None:
         self._apart: frozenset[str] = frozenset()
+        self._counts = True
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
         self._is_open = False
@@ -59,6 +60,8 @@ class NodeGate:
     def add(self, entity: object, gated: Gated) -> None:
         """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
+        if isinstance(gated, CountedSubscription):
+            gated.counts = self._counts
         if self._is_open:
             self._open(gated)
         else:
@@ -72,6 +75,14 @@ class NodeGate:
         """Forget an entity that is being destroyed."""
         self._entities.pop(id(entity), None)
         self._workers.pop(id(entity), None)
+
+    def count_nothing(self) -> None:
+        """Leave callbacks as they are: `executor: events` gives them no message info."""
+        self._counts = False
+        for gated in tuple(self._entities.values()):
+            if isinstance(gated, CountedSubscription):
+                gated.counts = False
+                (gated.open if self._is_open else gated.close)()
 
     def measure(self, apart: Collection[str]) -> None:
         """Count what arrives from now on by these clocks.
@@ -149,12 +160,15 @@ class CountedSubscription:
     Attributes:
         topic: fully qualified.
         is_apart: it is published by another host's clock.
+        counts: callbacks get the message info.
     """
 
     def __init__(self, subscription: Subscription) -> None:
         self._subscription = subscription
         self.topic = str(subscription.topic_name)
         self.is_apart = False
+        self.counts = True
+        self._users = subscription.callback
         self._is_open = False
         self._call = _taking_info(subscription.callback)
         self._counter: Counter | None = None
@@ -162,7 +176,10 @@ class CountedSubscription:
     def open(self) -> None:
         """Count from now on."""
         self._is_open = True
-        if self._counter is None or self._counter.is_apart is not self.is_apart:
+        if not self.counts:
+            self._counter = None
+            self._subscription.callback = self._users
+        elif self._counter is None or self._counter.is_apart is not self.is_apart:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
             self._subscription.callback = counting(self._call, self._counter)
@@ -171,7 +188,7 @@ class CountedSubscription:
         """Count no more."""
         self._is_open = False
         self._counter = None
-        self._subscription.callback = self._call
+        self._subscription.callback = self._call if self.counts else self._users
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""
@@ -204,7 +221,11 @@ class GatedSubscription(CountedSubscription):
     def close(self) -> None:
         """Drop messages."""
         super().close()
-        self._subscription.callback = self._drop
+        alone = not self.counts and _takes_one(self._users)
+        self._subscription.callback = self._drop_alone if alone else self._drop
+
+    def _drop_alone(self, message: object) -> None:
+        self._drop(message, {})
 
     def _drop(self, message: object, info: Info) -> None:
         if self._keeps:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 
 import msgspec
 
-from lifecycle.manifest.model import EndpointKind, Quantity, TargetState
+from lifecycle.manifest.model import EndpointKind, Executor, Quantity, TargetState
 from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
 from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
@@ -176,6 +176,8 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             yield "128 to 254 are an operator's own classes"
         if not self.flow.nodes[1].is_ours and not self.flow.planned.measure:
             yield f"{self.flow.subscription} does not run in our host"
+        elif self.flow.nodes[1].node.run.executor is Executor.EVENTS:
+            yield "executor: events gives callbacks no message info"
         if kinds & _DELAYS and not self.has_clocks:
             yield "the clocks of the two hosts are not compared"
         one_publishers = kinds - _DELAYS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import EndpointKind, Quantity, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Executor, Quantity, Run, RunKind
 from lifecycle.measure.delays import Delays, buckets_of
 from lifecycle.measure.sample import Measured, Sample, Slot
 from lifecycle.plan.model import Plan
@@ -206,3 +206,10 @@ def test_a_subscription_of_ours_measures_where_the_manifest_asks_for_it() -> Non
     )
     measured = {each.subscription: each.measure for each in asks_of_an_end.flows}
     assert measured == {"two": True, "three": False}
+
+
+def test_a_node_whose_executor_gives_no_message_info_is_named() -> None:
+    events = Run(kind=RunKind.PYTHON, python="robot:Node", executor=Executor.EVENTS)
+    found = of_data(judged(pair(number("rate_hz", 5), run=events), arrived(300, 10)))
+    assert [each.rule for each in found] == ["flow.not-measured"]
+    assert found[0].message.endswith("executor: events gives callbacks no message info")
