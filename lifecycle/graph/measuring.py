@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -40,11 +40,16 @@ class TopicMeasurements:
         self._since_ns: dict[str, int] = {}
         self._counters: dict[str, Counter] = {}
 
-    def listen(self, plan: Plan) -> None:
-        """Measure the topics that a plan asks for; the same again changes nothing."""
+    def listen(self, plan: Plan, machines: Collection[str] | None) -> None:
+        """Measure what a plan asks for at subscriptions on these machines; None for all.
+
+        The same again changes nothing.
+        """
         for flow in plan.flows:
             if not flow.measure or flow.topic in self._since_ns:
                 continue
+            if machines is not None and plan.node(flow.subscription).machine not in machines:
+                continue  # its own supervisor does
             self._since_ns[flow.topic] = time.monotonic_ns()
             for end in plan.node(flow.subscription).endpoints:
                 is_its = end.kind is EndpointKind.SUBSCRIPTION and end.resolved == flow.topic

@@ -129,7 +129,13 @@ class Observer:
 
     # -- one observation
 
-    async def observe(self, plan: Plan, *, only: Collection[str] | None = None) -> Observation:
+    async def observe(
+        self,
+        plan: Plan,
+        *,
+        only: Collection[str] | None = None,
+        machines: Collection[str] | None = None,
+    ) -> Observation:
         """Return what is there now, as the state has it then.
 
         Waits until every participant that was there before us is seen, which takes a moment at
@@ -143,6 +149,7 @@ class Observer:
         Args:
             plan: see above.
             only: full names of the planned nodes that are asked; None for all.
+            machines: whose subscriptions are measured where the plan asks for it; None for all.
 
         Raises:
             MiddlewareError: the graph can no longer be watched.
@@ -171,13 +178,14 @@ class Observer:
                 if node.health is not None and node.health.diagnostics
             }
         )
-        self._measurements.listen(plan)
+        self._measurements.listen(plan, machines)
         answers = await self._ask_all(plan, nodes, asked)
         self._answered = {name: said for name, (_, said) in answers.items() if said is not None}
         said = {**self.state.given, **self._answered}
         reporting = {name for name, each in said.items() if each.parameters is not None}
         if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
-            return await self.observe(plan, only=only)  # each node is waited for once
+            # Each node is waited for once.
+            return await self.observe(plan, only=only, machines=machines)
         for each in self._answered.values():
             self.state.learn(each)
         return self.state.observation(

@@ -108,12 +108,14 @@ def judge(
 def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | None) -> Judgement:
     assert bound.most is not None
     found, kept, observed = delays.quantile_ms(bound.quantile), None, ""
+    share: float | None = None
     is_enough = found is not None and (
         delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S
     )
     if found is not None and clock is not None:
         delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
         observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
+        share = delay_ms / bound.most
         if clock.uncertainty_ms:
             # The bucket from which it was read is as large as this at most.
             unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
@@ -132,9 +134,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         kept=kept,
         observed=observed,
         allowed=_limit("≤", ">", kept, ms(bound.most)),
-        share=None
-        if found is None or clock is None
-        else max(0.0, found + clock.offset_ms) / bound.most,
+        share=share,
         decides_in_s=decides_in_s,
         needs_clocks=needs_clocks,
     )

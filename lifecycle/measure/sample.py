@@ -85,13 +85,12 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
 
         All there is, where that is not enough.
         """
-        found: list[Slot] = []
+        past = Slot(seconds=0.0)
         for slot in self.slots:
-            found.append(slot)
-            past = Slot.of(found)
+            past = Slot.of((past, slot))
             if past.seconds >= seconds and past.published >= published:
-                return past
-        return Slot.of(found)
+                break
+        return past
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,7 +18,6 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Health
-from lifecycle.measure.sample import Measured
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.handlers import alternatives, match
@@ -219,10 +218,6 @@ class Managed:
             health=self._health.report,
             measured=self.gate.measured(),
         )
-
-    def measured(self) -> Measured | None:
-        """Return what has arrived since it was activated; None while it is not. Any thread."""
-        return self.gate.measured()
 
     # What the rows of the machine's table run, beside methods of gate and data layer.
 

@@ -30,7 +30,6 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -389,10 +388,6 @@ class ForeignNode:
             connections=self._connections,
             measured=self.gate.measured(),
         )
-
-    def measured(self) -> Measured | None:
-        """Return what has arrived since it was let through; None while it is held. Any thread."""
-        return self.gate.measured()
 
     @property
     def data_layer(self) -> DataLayer:

@@ -18,7 +18,7 @@ import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 import rclpy
@@ -217,12 +217,10 @@ class Host:
         if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
         if self._spec.measures:
-            self._measure(self._spec.apart)
+            self._begin_to_report()
 
-    def _measure(self, apart: Collection[str]) -> None:
-        """Count what arrives in each node from now on, and report it."""
-        for hosted in self._nodes.values():
-            hosted.gate.measure(apart)
+    def _begin_to_report(self) -> None:
+        """Report what is counted from now on; again is harmless."""
         if not self._reports:
             self._reports = True
             threading.Thread(target=self._report_measured, name="measured", daemon=True).start()
@@ -328,7 +326,7 @@ class Host:
         """Report again and again what active nodes have counted, whatever their callbacks do."""
         while not self._left.wait(SLOT_S):
             for name, hosted in tuple(self._nodes.items()):
-                measured = hosted.measured()
+                measured = hosted.gate.measured()
                 if measured is not None:
                     self._channel.write(Event(kind="measured", node=name, measured=measured))
 
@@ -361,7 +359,9 @@ class Host:
         elif operation is Operation.REPUBLISH_NAMES:
             self._loop.republish_names()
         elif operation is Operation.MEASURE:
-            self._measure(command.apart)
+            for hosted in self._nodes.values():
+                hosted.gate.measure(command.apart)
+            self._begin_to_report()
         elif operation is Operation.CONNECT_TO:
             node.data_layer.connect_to(command.connection, command.connections)
         elif operation is Operation.MAP_TO:

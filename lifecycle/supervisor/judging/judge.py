@@ -105,7 +105,8 @@ class Judge:
             self._observer.discovery.settling.expect_newcomers(everybody=True)
         system = self._system
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
-        observation = without(await self._observer.observe(self._asked()), system.dead())
+        seen = await self._observer.observe(self._asked(), machines=system.machines)
+        observation = without(seen, system.dead())
         run = system.run
         is_measured = run.held_s is not None and run.passage is None
         if is_measured:

@@ -243,7 +243,8 @@ class Looks:
             asked, looks = self._followed()
             if looks and not self._is_looked_at():
                 began = dict(self._system.processes)
-                seen = await self._graph.observe(self._system.plan, only=asked)
+                system = self._system
+                seen = await self._graph.observe(system.plan, only=asked, machines=system.machines)
                 self._saw(seen, began)
             remote = any(self._system.run.elsewhere.values())
             await set_within(changed, REMOTE_S if remote else None)

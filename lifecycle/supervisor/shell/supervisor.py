@@ -382,7 +382,9 @@ class Supervisor:
 
     async def is_seen(self, name: str) -> bool:
         """Return whether discovery shows a node of this name."""
-        observation = await self.means.participant.graph.observe(self.system.plan)
+        observation = await self.means.participant.graph.observe(
+            self.system.plan, machines=self.system.machines
+        )
         return any(each.full_name == name for each in observation.nodes)
 
     def may_activate(self, key: str) -> bool:

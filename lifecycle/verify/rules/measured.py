@@ -77,7 +77,7 @@ NOT_MEASURED = Rule(
     heals=Heals.NEVER,
     names_expected=True,
 )
-SILENT_SO_FAR = Rule(
+NOTHING_ARRIVED = Rule(
     id="flow.nothing-arrived",
     meaning="a number cannot be measured, because nothing has arrived since activation",
     outcomes=(Outcome.UNVERIFIABLE,),
@@ -86,7 +86,7 @@ SILENT_SO_FAR = Rule(
     names_expected=True,
     measured=True,
 )
-RULES = (DELAY, RATE, LOSS, SILENT, NOT_MEASURED, SILENT_SO_FAR)
+RULES = (DELAY, RATE, LOSS, SILENT, NOT_MEASURED, NOTHING_ARRIVED)
 
 _RULES = {
     Kind.DELAY: DELAY,
@@ -147,7 +147,7 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         clock: what is known of the clocks of all who publish to the subscription; None if one is
             not known.
         own: numbers of its links and its publishers.
-        of_topic: numbers of its subscription: they are of the topic, whoever publishes.
+        of_topic: numbers of its subscription: they are of the topic, by all its publishers.
     """
 
     flow: FlowView
@@ -163,6 +163,24 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """How messages name it."""
         flow = self.flow
         return f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+
+    def finding(self, rule: Rule, quantity: Quantity, observed: str, message: str) -> Finding:
+        """Return a finding on one of its numbers."""
+        return rule.finding(
+            subject=self.flow.subject,
+            expected=str(quantity),
+            observed=observed,
+            message=message,
+            at=quantity.at,
+            ends=self.flow.ends,
+        )
+
+    def not_measured(
+        self, quantity: Quantity, why: str, *, rule: Rule = NOT_MEASURED, observed: str = ""
+    ) -> Finding:
+        """Return the finding that one of its numbers is not measured, and why."""
+        message = f"{quantity} of {self.where} is not measured: {why}"
+        return self.finding(rule, quantity, observed or "not measured", message)
 
     def why_not(self, quantity: Quantity) -> str:
         """Return why a number of it cannot be measured; empty if it can."""
@@ -222,14 +240,7 @@ def check(view: View) -> Iterator[Finding]:
     for each in counted:
         for quantity in each.flow.planned.quantities:
             if why := each.why_not(quantity):
-                yield NOT_MEASURED.finding(
-                    subject=each.flow.subject,
-                    expected=str(quantity),
-                    observed="not measured",
-                    message=f"{quantity} of {each.where} is not measured: {why}",
-                    at=quantity.at,
-                    ends=each.flow.ends,
-                )
+                yield each.not_measured(quantity, why)
         if _is_active(view, each.flow):
             yield from _judged(view, each)
 
@@ -293,34 +304,14 @@ def _judged(view: View, each: _Counted) -> Iterator[Finding]:
         sample = each.sample
         assert sample is not None
         if judgement.kept is False:
-            yield _RULES[bound.kind].finding(
-                subject=each.flow.subject,
-                expected=str(quantity),
-                observed=judgement.observed,
-                message=f"{each.where}: {judgement.observed} {judgement.allowed}",
-                at=quantity.at,
-                ends=each.flow.ends,
-            )
+            message = f"{each.where}: {judgement.observed} {judgement.allowed}"
+            yield each.finding(_RULES[bound.kind], quantity, judgement.observed, message)
         elif _is_given_up(judgement) and view.clocks is not None:
             why = _too_uncertain(quantity, bound, judgement, each)
-            yield NOT_MEASURED.finding(
-                subject=each.flow.subject,
-                expected=str(quantity),
-                observed=judgement.observed or "not measured",
-                message=f"{quantity} of {each.where} is not measured: {why}",
-                at=quantity.at,
-                ends=each.flow.ends,
-            )
+            yield each.not_measured(quantity, why, observed=judgement.observed)
         elif judgement.kept is None and not sample.messages and sample.seconds > PROBATION_S:
-            yield SILENT_SO_FAR.finding(
-                subject=each.flow.subject,
-                expected=str(quantity),
-                observed="no message",
-                message=f"{quantity} of {each.where} is not measured: nothing has arrived for"
-                f" {sample.silent_s:.0f} s",
-                at=quantity.at,
-                ends=each.flow.ends,
-            )
+            why = f"nothing has arrived for {sample.silent_s:.0f} s"
+            yield each.not_measured(quantity, why, rule=NOTHING_ARRIVED, observed="no message")
 
 
 def _unmeasured_at(
@@ -376,7 +367,7 @@ def _counted(view: View) -> list[_Counted]:
                 of_topic=numbers,
             )
             found.append(counted)
-            numbers = ()  # they are judged once, whoever publishes
+            numbers = ()  # they are judged once, for all publishers
     return found
 
 
@@ -434,11 +425,12 @@ def _differ(flow: FlowView) -> bool:
 def _sample(view: View, flow: FlowView) -> Sample | None:
     """Return what a subscription has counted, where its node is one that is brought up here."""
     facts: NodeFacts = flow.nodes[1]
+    if not brings_up(facts.node, view.machines):
+        return None  # its own supervisor has what it counts
     if flow.planned.measure and view.measured is not None:
         return view.measured.of(flow.planned.topic)
     configuration = facts.configuration
-    # Of a node of another supervisor, that one has what it counts.
-    if configuration is None or not facts.is_ours or not brings_up(facts.node, view.machines):
+    if configuration is None or not facts.is_ours:
         return None
     measured = configuration.measured
     found = None if measured is None else measured.of(flow.planned.topic)
