@@ -184,8 +184,14 @@ class FakeParticipant:
         del everybody
         return False
 
-    async def observe(self, plan: Plan, *, only: Collection[str] | None = None) -> Observation:
-        del plan, only
+    async def observe(
+        self,
+        plan: Plan,
+        *,
+        only: Collection[str] | None = None,
+        machines: Collection[str] | None = None,
+    ) -> Observation:
+        del plan, only, machines
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import EndpointKind, Executor, Quantity, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Executor, Machine, Quantity, Run, RunKind
 from lifecycle.measure.delays import Delays, buckets_of
 from lifecycle.measure.sample import Measured, Sample, Slot
 from lifecycle.plan.model import Plan
@@ -206,6 +206,27 @@ def test_a_subscription_of_ours_measures_where_the_manifest_asks_for_it() -> Non
     )
     measured = {each.subscription: each.measure for each in asks_of_an_end.flows}
     assert measured == {"two": True, "three": False}
+
+
+def test_a_subscription_of_ours_is_judged_by_the_supervisor_of_the_node_that_subscribes() -> None:
+    plan = planned(
+        node("one", publisher("a"), machine="near"),
+        node("two", subscription("a"), run=FOREIGN, machine="far"),
+        links=[link("/a", "one", "two", quantities=(number("rate_hz", 15),), measure=True)],
+        machines=tuple(Machine(name=each, at=at(2)) for each in ("near", "far")),
+    )
+    slow = Measured(active_s=0, samples=(("/a", arrived(50, 10)),))
+    seen = replace(perfect(plan, Stage.ACTIVE), measured=slow)
+    found = {
+        machine: [
+            each.rule
+            for each in of_data(
+                verify(plan, seen, stage=Stage.ACTIVE, machines=frozenset({machine}))
+            )
+        ]
+        for machine in ("near", "far")
+    }
+    assert found == {"near": [], "far": ["flow.rate"]}
 
 
 def test_a_node_whose_executor_gives_no_message_info_is_named() -> None:
