@@ -65,9 +65,9 @@ async def test_nodes_that_are_activated_side_by_side_are_not_judged_one_by_one(
     opened: list[int] = []
     observe = world.graph.observe
 
-    async def counted(plan: Any) -> Any:
+    async def counted(plan: Any, **how: Any) -> Any:
         looks.append(0)
-        return await observe(plan)
+        return await observe(plan, **how)
 
     world.graph.observe = counted  # type: ignore[method-assign]
     world.story.in_the_moment["[gate]"] = lambda: opened.append(len(looks))

@@ -127,9 +127,9 @@ async def test_a_silent_node_is_not_asked_for_and_is_judged_silent(tmp_path: Pat
     asked: list[list[str]] = []
     observe = world.graph.observe
 
-    async def noted(plan: Any) -> Observation:
+    async def noted(plan: Any, **how: Any) -> Observation:
         asked.append([each.key for each in plan.nodes])
-        return await observe(plan)
+        return await observe(plan, **how)
 
     world.graph.observe = noted  # type: ignore[method-assign]
     async with world.running("[system] active"):
