@@ -54,12 +54,10 @@ class Slot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """What one endpoint has counted since its node was activated.
-
-    Of a publisher only `seconds` is known: nothing is counted where data are sent.
+    """What one subscription has counted since its node was activated.
 
     Attributes:
-        seconds: how long it has counted, or a publisher has been let publish.
+        seconds: how long it has counted.
         silent_s: since the last message, or since it counts where none has arrived.
         messages: how many arrived.
         lost: how many did not; None where the RMW gives no publication sequence numbers.
