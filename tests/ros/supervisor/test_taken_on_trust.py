@@ -60,7 +60,15 @@ def test_ordinary_ros_2_nodes_whose_qos_nobody_wrote_pass_the_strict_gate(
 def test_numbers_that_nobody_measures_are_named_at_the_gate_and_refused_when_strict(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    edit = {"nodes/talker/flows": {"publishers": {"chatter": _NUMBERS}}}
+    # Its host would count what arrives; a program of others counts nothing.
+    listener = _ordinary(
+        *("listener", "--subscribe", "/chatter:std_msgs/msg/String:RELIABLE"),
+        subscriptions=[{"name": "/chatter", "type": "std_msgs/msg/String"}],
+    )
+    edit = {
+        "nodes/talker/flows": {"publishers": {"chatter": _NUMBERS}},
+        "nodes/listener": listener,
+    }
     manifest = pair(tmp_path, fresh_domain, edit=edit)
     trusted = (
         "max_delay_ms 0.0001 of /chatter, loss 1e-06 of /chatter and 2 more (flow.not-measured)"
