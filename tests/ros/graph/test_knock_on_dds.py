@@ -8,12 +8,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from types import SimpleNamespace
 
 import pytest
 
 from lifecycle.graph.graph import Graph
 from lifecycle.middleware.discovery.environment import SETTLE_S
+from tests.builders import plan_of
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]
@@ -34,7 +34,7 @@ os._exit(0)
 """
 """Ends when told to, whatever rclpy's own handling of signals makes of it in its first moment."""
 
-NOTHING = SimpleNamespace(nodes=(), system="nothing", modes=())
+NOTHING = plan_of()
 TIMES = 6
 
 
