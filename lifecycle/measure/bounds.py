@@ -2,12 +2,14 @@
 
 Owns: how much each bound needs to be judged: a delay 200 messages or 5 s, a loss 10 / bound
 messages, a rate 2 s and 20 periods. Until then nothing is said of it, as a canary analysis says
-nothing before its first interval is over.
+nothing before its first interval is over. A delay is violated by more late messages than chance
+explains; between that and its quantile the sample decides nothing.
 """
 
 from __future__ import annotations
 
 import enum
+import math
 
 import msgspec
 
@@ -23,6 +25,9 @@ LOSS_EVENTS = 10
 CLOCKS_S = 8.0
 """A delay that the clocks of two hosts do not let decide is waited for so long: within the
 probation of a system."""
+
+_ONE_PERCENT = 2.326
+"""So many standard deviations above the mean are 1 % of a normal distribution."""
 
 REPORTED_S = 1.0
 """The reports of two nodes are of moments that are less than this apart."""
@@ -112,6 +117,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
     is_enough = found is not None and (
         delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S
     )
+    needs_clocks = is_enough
     if found is not None and clock is not None:
         delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
         observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
@@ -120,11 +126,12 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
             # The bucket from which it was read is as large as this at most.
             unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
             observed += f" ± {ms(unsure_ms)}"
-        if is_enough and delay_ms - unsure_ms > bound.most:
+        late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
+        if is_enough and late >= too_many_late(delays.messages, 1 - bound.quantile):
             kept = False
         elif is_enough and delay_ms + unsure_ms <= bound.most:
             kept = True
-    needs_clocks = is_enough and kept is None
+        needs_clocks = is_enough and kept is None and delay_ms - unsure_ms <= bound.most
     decides_in_s: float | None = None
     if needs_clocks and sample.seconds < CLOCKS_S:
         decides_in_s = CLOCKS_S - sample.seconds
@@ -138,6 +145,21 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         decides_in_s=decides_in_s,
         needs_clocks=needs_clocks,
     )
+
+
+def too_many_late(messages: int, share: float) -> int:
+    """Return how many late messages are no chance any more, where a share of all may be late.
+
+    Were each message late with that probability, so many would be in 1 % of samples at most. The
+    normal approximation of the binomial distribution, and 2 more because that is skewed.
+
+    Args:
+        messages: > 0, of the sample; that all are late is never chance.
+        share: > 0 and < 1.
+    """
+    expected = messages * share
+    spread = math.sqrt(expected * (1 - share))
+    return min(messages, int(expected + _ONE_PERCENT * spread + 2))
 
 
 def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:

@@ -114,3 +114,8 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
             if rank <= 0:
                 return (least_ns(bucket) + (self.shift_ns or 0)) / _NS_PER_MS
         raise AssertionError("the ranks of a histogram end with its messages")
+
+    def later_than(self, ms: float) -> int:
+        """Return how many messages were later than this for certain, milliseconds."""
+        longest_ns = ms * _NS_PER_MS - (self.shift_ns or 0)
+        return sum(number for bucket, number in self.buckets if least_ns(bucket) > longest_ns)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lifecycle.measure.bounds import Bound, Judgement, Kind, judge
+from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, too_many_late
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, buckets_of, least_ns
 from lifecycle.measure.sample import DELAY_S, SLOT_S, Sample
@@ -137,13 +137,41 @@ def test_a_delay_is_judged_after_200_messages_or_5_s() -> None:
 
 
 def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
-    slow = [(at_s, 8.0 if number % 30 == 0 else 1.0, number) for at_s, _, number in steady(100, 2)]
+    slow = [(at_s, 8.0 if number % 20 == 0 else 1.0, number) for at_s, _, number in steady(100, 2)]
     assert verdict(DELAY, counted(slow, until_s=2)) is False
     assert verdict(Bound(kind=Kind.DELAY, most=5.0, quantile=0.9), counted(slow, until_s=2)) is True
     later = [(at_s + 2, delay, number + 200) for at_s, delay, number in steady(100, 2)]
     assert verdict(DELAY, counted([*slow, *later], until_s=4)) is True
     one = [(at_s, 90.0 if number == 7 else 1.0, number) for at_s, _, number in steady(15, 5)]
     assert verdict(DELAY, counted(one, until_s=5)) is True  # one message is no quantile
+
+
+@pytest.mark.parametrize(
+    ("late", "kept"), [(2, True), (3, None), (too_many_late(200, 0.01) - 1, None), (7, False)]
+)
+def test_late_messages_that_may_be_chance_decide_nothing(late: int, kept: bool | None) -> None:
+    delays = ((at_s, number, 99 < number < 100 + late) for at_s, _, number in steady(100, 2))
+    some = [(at_s, 8.0 if is_late else 1.0, number) for at_s, number, is_late in delays]
+    found = judge(DELAY, counted(some, until_s=2))
+    assert (found.kept, found.needs_clocks, found.decides_in_s) == (kept, False, None)
+
+
+@given(st.integers(1, 3000), st.sampled_from([0.5, 0.1, 0.05, 0.02, 0.01, 0.001]))
+def test_too_many_late_messages_are_in_about_1_percent_of_samples(
+    messages: int, share: float
+) -> None:
+    number = too_many_late(messages, share)
+    logs = (
+        math.lgamma(messages + 1)
+        - math.lgamma(each + 1)
+        - math.lgamma(messages - each + 1)
+        + each * math.log(share)
+        + (messages - each) * math.log1p(-share)
+        for each in range(number, messages + 1)
+    )
+    chance = sum(map(math.exp, logs))
+    assert chance < 0.0125 or number == messages
+    assert number > messages * share
 
 
 def test_reception_is_judged_for_the_network() -> None:
