@@ -966,7 +966,7 @@ RULE_IDS = tuple(
         ("graph", "unmatched-link unmatched-flow unknown-peer unmatched-client"),
         ("endpoint", "error"),
         ("flow", "unreported not-unique unverifiable broken-endpoint not-measured"),
-        ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable"),
+        ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable dscp-lost"),
         ("flow", "delay rate loss silent nothing-arrived"),
         ("state", "wrong-state unverifiable activated-at-closed-gate"),
         ("node", "unhealthy without-health"),

@@ -130,6 +130,7 @@ def lay_out(
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
         measured=observation.measured,
         clocks=None if observation.clocks is None else dict(observation.clocks),
+        marks={(each.machine, each.dscp): each.arrives_as for each in observation.marks},
     )
 
 

@@ -323,6 +323,20 @@ class ObservedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     silent: bool = False
 
 
+class ArrivedMark(msgspec.Struct, frozen=True, kw_only=True):
+    """With what DSCP datagrams arrive that another machine's supervisor sends beside a flow.
+
+    Attributes:
+        machine: its name.
+        dscp: with which they are sent.
+        arrives_as: None if they should have arrived, and did not.
+    """
+
+    machine: str
+    dscp: int
+    arrives_as: int | None
+
+
 class Observation(msgspec.Struct, frozen=True, kw_only=True):
     """Everything seen of a system at one moment, tools and what they use included.
 
@@ -331,6 +345,7 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
         measured: what subscriptions of the observer have counted; None where it has none.
         clocks: of the hosts of other machines of the system, each after the machine's name; None
             where nobody compares them, or delays are not judged yet.
+        marks: from other machines of the system, where flows with a DSCP come from them.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
@@ -339,3 +354,4 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
     parameters: tuple[NodeParameters, ...] = ()
     measured: Measured | None = None
     clocks: tuple[tuple[str, ClockOffset], ...] | None = None
+    marks: tuple[ArrivedMark, ...] = ()

@@ -202,6 +202,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         measured: what subscriptions of the observer have counted; None where it has none.
         clocks: of the hosts of other machines, by the machine's name, as far as they are known;
             None where that is not the question yet.
+        marks: with what DSCP arrives what supervisors of other machines send, by the machine's name
+            and the DSCP with which it is sent; None for what should have arrived, and did not.
     """
 
     plan: Plan
@@ -228,6 +230,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     uniqueness: Uniqueness
     measured: Measured | None
     clocks: Mapping[str, ClockOffset] | None
+    marks: Mapping[tuple[str, int], int | None]
 
 
 def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:

@@ -11,7 +11,8 @@ peer's writer is removed.
 
 Beside which nodes are silent, a notice says when its sender received the last one of each other
 supervisor. So two of them exchange the four timestamps by which their clocks are compared
-(lifecycle.measure.clock): Fast DDS takes them where it sends and receives.
+(lifecycle.measure.clock): Fast DDS takes them where it sends and receives. It says on which ports
+its sender receives marked datagrams, too (lifecycle.supervisor.health.marks).
 
 `PlanNotices` is the topic on which supervisors of one domain publish their plans, to detect
 conflicts. Its name holds no system: a supervisor that was started with another manifest must be
@@ -27,7 +28,6 @@ import threading
 import time
 import typing
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 
 import msgspec
 from rclpy.duration import Duration
@@ -59,13 +59,22 @@ _LONGEST_NOTICE = 1 << 16
 
 _Ns = typing.Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 
-Received = Mapping[str, tuple[int, int]]
-"""When the last notice of each machine was sent, on its clock, and received, on ours; ns."""
+_Port = typing.Annotated[int, msgspec.Meta(ge=0, le=65535)]
 
 
-class _Notice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    silent: dict[str, str]
-    received: dict[str, tuple[_Ns, _Ns]] = {}
+class Notice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a participant says beside that it is alive.
+
+    Attributes:
+        silent: which of its nodes are silent, and why each is.
+        received: when the last notice of each other machine was sent, on that one's clock, and
+            received, on the sender's; ns.
+        marks: ports on which it receives marked datagrams, over IPv4 and IPv6; 0 for none.
+    """
+
+    silent: Mapping[str, str]
+    received: Mapping[str, tuple[_Ns, _Ns]] = {}
+    marks: tuple[_Port, _Port] = (0, 0)
 
 
 _logger = logging.getLogger(__name__)
@@ -114,15 +123,12 @@ class AlivePublisher:
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
-    def notify(self, silent: Mapping[str, str], received: Received = MappingProxyType({})) -> None:
-        """Publish which of our nodes are silent, and why each is; from any thread.
-
-        With `received`, as AliveSubscription has them, clocks are compared.
+    def notify(self, notice: Notice) -> None:
+        """Publish which of our nodes are silent, and what else there is to say; from any thread.
 
         Present and later subscribers receive it. A message may be lost for some seconds: publish
         it again.
         """
-        notice = _Notice(silent=dict(silent), received=dict(received))
         self._publisher.publish(String(data=to_json(notice).decode()))
 
     def destroy(self) -> None:
@@ -164,9 +170,8 @@ class AliveSubscription:
         topic: of the publisher.
         on_liveliness: called with True when it is alive, False when its lease has expired.
         on_left: called when it left properly.
-        on_notice: called with the silent nodes that `AlivePublisher.notify` published.
-        on_times: called before it with when that was sent, on its clock, and received, on ours, in
-            nanoseconds, and with what its sender has received.
+        on_notice: called with what `AlivePublisher.notify` published, when that was sent, on its
+            clock, and when it was received, on ours, in nanoseconds.
     """
 
     def __init__(
@@ -176,8 +181,7 @@ class AliveSubscription:
         *,
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_notice: Callable[[Mapping[str, str]], None],
-        on_times: Callable[[int, int, Received], None],
+        on_notice: Callable[[Notice, int, int], None],
     ) -> None:
         def changed(info: QoSLivelinessChangedInfo) -> None:
             if info.alive_count > 0:
@@ -189,14 +193,13 @@ class AliveSubscription:
 
         def received(message: String, info: Mapping[str, int]) -> None:
             try:
-                notice = from_json(message.data, _Notice, longest=_LONGEST_NOTICE)
+                notice = from_json(message.data, Notice, longest=_LONGEST_NOTICE)
             except ValueError as error:
                 # Any participant may write the topic, and no executor thread may end by it.
                 _logger.warning("cannot read what is silent: %s", error)
                 return
             received_ns = info["received_timestamp"] or time.time_ns()
-            on_times(info["source_timestamp"], received_ns, notice.received)
-            on_notice(notice.silent)
+            on_notice(notice, info["source_timestamp"], received_ns)
 
         self._node = node
         self._subscriptions = (

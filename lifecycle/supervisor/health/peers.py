@@ -1,9 +1,9 @@
 """The other supervisors of a system, and the nodes that it attaches to: alive, lost, left, agreed.
 
 Owns: `Peers`: announcing ourselves and our plan, noticing who is found, lost or shut down, what
-they report of silent nodes, comparing clocks and plans. A manifest with another node, another
-argument or another flow need on one of the hosts passes every check of the running graph there:
-only the plans show it. Nothing here polls. Must not import rclpy.
+they report of silent nodes, comparing clocks and plans, and marks that arrive. A manifest with
+another node, another argument or another flow need on one of the hosts passes every check of the
+running graph there: only the plans show it. Nothing here polls. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -33,22 +33,23 @@ from lifecycle.plan.comparison import (
     notice_of,
 )
 from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.health.marks import Marks, carries_marks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify.observation import Observation
+from lifecycle.verify.observation import ArrivedMark, Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.measured import compares_clocks
 from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
-from lifecycle.verify.verdict import Finding, Verdict
+from lifecycle.verify.verdict import Finding, FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.middleware.discovery.liveliness import (
         AlivePublisher,
         AliveSubscription,
+        Notice,
         PlanNotices,
-        Received,
     )
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
@@ -60,7 +61,8 @@ SAID_AFTER_S = (0.0, 0.1, 0.4)
 """Which nodes are silent is published again: Fast DDS repeats what was lost after up to 3 s."""
 
 EXCHANGED_S = 1.0
-"""Clocks are compared so often, where a delay between machines is declared."""
+"""Clocks are compared so often, where a delay between machines is declared, and marks are sent,
+where a DSCP is."""
 
 FAILED = "failed: "
 """How the reason of a supervisor begins whose run failed."""
@@ -113,6 +115,8 @@ class Peers:
         self._exchanging: asyncio.TimerHandle | None = None
         self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
+        self._marks = Marks(self._run)
+        self._judged_marks: tuple[ArrivedMark, ...] = ()
         self._said: PlanNotice | None = None
         self._known: list[PlanNotice] = []
         self._since: dict[str, float] = {}
@@ -179,6 +183,7 @@ class Peers:
         if self._notices is not None:
             self._notices.destroy()
             self._notices = None
+        self._marks.close()
         await ended(*self._tasks)
         for peer in (*self._supervisors, *self._attached.values()):
             _forget(peer)
@@ -211,8 +216,7 @@ class Peers:
             topic,
             on_liveliness=calls(self._alive),
             on_left=calls(self._left),
-            on_notice=calls(self._reported),
-            on_times=calls(self._timed),
+            on_notice=calls(self._noticed),
         )
         return peer
 
@@ -257,7 +261,9 @@ class Peers:
             self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
         self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
 
-    def _reported(self, peer: _Peer, silent: Mapping[str, str]) -> None:
+    def _noticed(self, peer: _Peer, notice: Notice, sent_ns: int, received_ns: int) -> None:
+        self._compare(peer.machine, notice, sent_ns, received_ns)
+        silent = notice.silent
         for name in peer.nodes:
             if name in silent:
                 self._system.liveliness.fell_silent((name,), Cause.REPORTED, silent[name])
@@ -275,31 +281,53 @@ class Peers:
 
         def say() -> None:
             if silent is self._silent:
-                for each in self._announcements:
-                    each.notify(silent, self._received)
+                self._notify()
 
         for wait_s in SAID_AFTER_S:
             self._loop.call_later(wait_s, say)
 
-    # What time it is there
+    def _notify(self) -> None:
+        from lifecycle.middleware.discovery.liveliness import Notice
+
+        notice = Notice(silent=self._silent, received=self._received, marks=self._marks.own_ports)
+        for each in self._announcements:
+            each.notify(notice)
+
+    # What time it is there, and what arrives as it is sent
 
     def _exchange(self) -> None:
-        """Have others compare their clocks with ours, again and again while that is needed."""
+        """Have others compare with what is here, again and again while that is needed."""
         self._exchanging = None
-        if compares_clocks(self._system.first):
-            for each in self._announcements:
-                each.notify(self._silent, self._received)
+        carries = carries_marks(self._system.first)
+        if carries:
+            self._marks.open()
+            self._marks.send()
+            if self._judged_marks != self._marks.arrived():
+                self._system.touch()
+        if carries or compares_clocks(self._system.first):
+            self._notify()
             self._exchanging = self._loop.call_later(EXCHANGED_S, self._exchange)
 
-    def _timed(self, peer: _Peer, sent_ns: int, received_ns: int, theirs: Received) -> None:
+    def _compare(self, machine: str, notice: Notice, sent_ns: int, received_ns: int) -> None:
         """It sent a notice, having received ours."""
-        if not peer.machine:
+        if not machine:
             return
-        self._received[peer.machine] = (sent_ns, received_ns)
-        clock = self._clocks.setdefault(peer.machine, ClockComparison())
-        for machine in self._own:
-            if machine in theirs:
-                clock.add(*theirs[machine], sent_ns, received_ns)
+        self._marks.ports[machine] = notice.marks
+        self._received[machine] = (sent_ns, received_ns)
+        clock = self._clocks.setdefault(machine, ClockComparison())
+        for own in self._own:
+            if own in notice.received:
+                clock.add(*notice.received[own], sent_ns, received_ns)
+
+    def follow(self, flows: Iterable[FlowReport]) -> None:
+        """Take the flows as they were verified just now."""
+        machines = {each.full_name: each.machine for each in self._system.first.nodes}
+        self._marks.follow(flows, machines, self._own)
+
+    def marks(self) -> tuple[ArrivedMark, ...]:
+        """Return with what DSCP arrives what other supervisors send beside flows to us."""
+        self._judged_marks = self._marks.arrived()
+        return self._judged_marks
 
     def clocks(self) -> tuple[tuple[str, ClockOffset], ...]:
         """Return how far the clocks of other machines are ahead, of those that are known."""
@@ -337,6 +365,7 @@ class Peers:
             return  # it left before we came
         others = (each for each in self._known if not notice.replaces(each))
         self._known = [*others, notice][-_MOST:]
+        self._marks.machines = {each.run: each.machines for each in self._known}
         self._system.touch()
 
     def _shut_down(self) -> dict[str, str]:

@@ -110,7 +110,9 @@ class Judge:
         run = system.run
         is_measured = run.held_s is not None and run.passage is None
         if is_measured:
-            observation = replace(observation, clocks=self._peers.clocks())
+            observation = replace(
+                observation, clocks=self._peers.clocks(), marks=self._peers.marks()
+            )
         self.seen = observation
         system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
@@ -124,8 +126,9 @@ class Judge:
             ahead=system.run.ahead,  # as of now: some are activated meanwhile
             over=system.over(),
         )
+        self._peers.follow(verdict.flows)
         # Where nothing is declared, hosts do not report what they count.
-        if not is_measured or not expected.bounds:
+        if not is_measured or not (expected.bounds or observation.marks):
             verdict = without_measured(verdict, expected.policy)
         verdict = self._without_passing_peers(verdict, stage)
         limits = unlimited(each.planned for each in system.run.processes.values())

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from lifecycle.middleware.discovery.liveliness import (
         AlivePublisher,
         AliveSubscription,
+        Notice,
         PlanNotices,
-        Received,
     )
     from lifecycle.middleware.rcl.graph import GraphObserver
     from lifecycle.middleware.services.ros_interface import RosInterface
@@ -120,8 +120,7 @@ class ObserverParticipant:
         *,
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_notice: Callable[[Mapping[str, str]], None],
-        on_times: Callable[[int, int, Received], None],
+        on_notice: Callable[[Notice, int, int], None],
     ) -> AliveSubscription:
         """Watch the liveliness of another supervisor, or of a node that is attached."""
         from lifecycle.middleware.discovery.liveliness import AliveSubscription
@@ -132,7 +131,6 @@ class ObserverParticipant:
             on_liveliness=on_liveliness,
             on_left=on_left,
             on_notice=on_notice,
-            on_times=on_times,
         )
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:

@@ -44,6 +44,7 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (flows.TRANSPORT_RULES, flows.check_transport),
     (flows.DSCP_RULES, flows.check_dscp),
     (measured.RULES, measured.check),
+    (measured.MARK_RULES, measured.check_marks),
 )
 
 RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *run.RULES)

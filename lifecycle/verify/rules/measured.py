@@ -20,6 +20,7 @@ from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
 from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.measure.sample import DELAY_S, Sample
+from lifecycle.network.dscp import describe
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.outcome import Outcome
@@ -86,7 +87,17 @@ NOTHING_ARRIVED = Rule(
     names_expected=True,
     measured=True,
 )
+DSCP_LOST = Rule(
+    id="flow.dscp-lost",
+    meaning="the DSCP of a flow does not arrive at the other host",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="have what is between the hosts keep the DSCP (RFC 2474): a router or switch that does not"
+    " trust it, a tunnel or a radio link that does not copy it; or have it set it again",
+    heals=Heals.WITH_TIME,
+    measured=True,
+)
 RULES = (DELAY, RATE, LOSS, SILENT, NOT_MEASURED, NOTHING_ARRIVED)
+MARK_RULES = (DSCP_LOST,)
 
 _RULES = {
     Kind.DELAY: DELAY,
@@ -243,6 +254,32 @@ def check(view: View) -> Iterator[Finding]:
                 yield each.not_measured(quantity, why)
         if _is_active(view, each.flow):
             yield from _judged(view, each)
+
+
+def check_marks(view: View) -> Iterator[Finding]:
+    """Judge with what DSCP arrives what is sent beside each flow from another host to this one."""
+    for flow in view.flows if view.marks else ():
+        publisher, subscriber = (each.node for each in flow.nodes)
+        if not brings_up(subscriber, view.machines) or not _differ(flow):
+            continue
+        asked = (each.planned.dscp for each in flow.publishers)
+        for dscp in {each: None for each in asked if each is not None}:
+            arrives_as = view.marks.get((publisher.machine, dscp), dscp)
+            if arrives_as == dscp:
+                continue  # or it is too early
+            known = arrives_as is not None
+            observed = "nothing" if arrives_as is None else describe(arrives_as)
+            what = f"what {publisher.machine} sends as {describe(dscp)} beside the flow"
+            yield DSCP_LOST.finding(
+                outcome=Outcome.VIOLATED if known else Outcome.UNVERIFIABLE,
+                subject=flow.subject,
+                expected=describe(dscp),
+                observed=observed,
+                message=f"{what} {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+                + (f" arrives as {observed}" if known else " does not arrive"),
+                at=flow.at,
+                ends=flow.ends,
+            )
 
 
 def measurements(view: View) -> tuple[FlowMeasurement, ...]:

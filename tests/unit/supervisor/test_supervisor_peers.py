@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from lifecycle.cli.up_output import describe
 from lifecycle.manifest.model import DiscoveryRange, Machine, Quantity, Run, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
-from lifecycle.middleware.discovery.liveliness import Received
+from lifecycle.middleware.discovery.liveliness import Notice
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.comparison import decode, encode, notice_of
 from lifecycle.plan.model import Plan, PlannedFlow
@@ -58,7 +58,8 @@ class FakeAir:
     def __init__(self) -> None:
         self.watched: dict[str, SimpleNamespace] = {}
         self.announced: dict[str, list[Mapping[str, str]]] = {}
-        self.received: list[Received] = []
+        self.received: list[dict[str, tuple[int, int]]] = []
+        self.ports = (0, 0)
         self.plans: list[str] = []
         self.arrives: Callable[[str], None] | None = None
         self.done: list[str] = []
@@ -66,9 +67,10 @@ class FakeAir:
     def announce_alive(self, topic: str) -> SimpleNamespace:
         said = self.announced.setdefault(topic, [])
 
-        def notify(silent: Mapping[str, str], received: Received) -> None:
-            said.append(dict(silent))
-            self.received.append(dict(received))
+        def notify(notice: Notice) -> None:
+            said.append(dict(notice.silent))
+            self.received.append(dict(notice.received))
+            self.ports = notice.marks
 
         return SimpleNamespace(notify=notify, destroy=lambda: None)
 
@@ -78,14 +80,15 @@ class FakeAir:
         *,
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_notice: Callable[[Mapping[str, str]], None],
-        on_times: Callable[[int, int, Received], None],
+        on_notice: Callable[[Notice, int, int], None],
     ) -> SimpleNamespace:
         self.watched[topic] = SimpleNamespace(
             alive=on_liveliness,
             left=on_left,
-            silent=on_notice,
-            times=on_times,
+            silent=lambda silent: on_notice(Notice(silent=silent), 0, 0),
+            times=lambda sent, got, received, marks=(0, 0): on_notice(
+                Notice(silent={}, received=received, marks=marks), sent, got
+            ),
             destroy=lambda: self.watched.pop(topic),
         )
         return self.watched[topic]
