@@ -2,8 +2,8 @@
 
 Owns: how much each bound needs to be judged: a delay 200 messages or 5 s, a loss 10 / bound
 messages, a rate 2 s and 20 periods. Until then nothing is said of it, as a canary analysis says
-nothing before its first interval is over. A delay is violated by more late messages than chance
-explains; between that and its quantile the sample decides nothing.
+nothing before its first interval is over. Of fewer messages than 200 more must be late than chance
+explains, or they decide nothing.
 """
 
 from __future__ import annotations
@@ -117,7 +117,6 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
     is_enough = found is not None and (
         delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S
     )
-    needs_clocks = is_enough
     if found is not None and clock is not None:
         delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
         observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
@@ -126,17 +125,20 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
             # The bucket from which it was read is as large as this at most.
             unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
             observed += f" ± {ms(unsure_ms)}"
-        late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
-        if is_enough and late >= too_many_late(delays.messages, 1 - bound.quantile):
+        is_late = delay_ms - unsure_ms > bound.most
+        if is_late and delays.messages < DELAY_MESSAGES:
+            late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
+            is_enough = is_enough and late >= too_many_late(delays.messages, 1 - bound.quantile)
+        if is_enough and is_late:
             kept = False
         elif is_enough and delay_ms + unsure_ms <= bound.most:
             kept = True
-        needs_clocks = is_enough and kept is None and delay_ms - unsure_ms <= bound.most
+    needs_clocks = is_enough and kept is None
     decides_in_s: float | None = None
     if needs_clocks and sample.seconds < CLOCKS_S:
         decides_in_s = CLOCKS_S - sample.seconds
-    elif not is_enough:
-        decides_in_s = max(0.0, DELAY_S - delays.seconds)
+    elif not is_enough and delays.seconds < DELAY_S:
+        decides_in_s = DELAY_S - delays.seconds
     return Judgement(
         kept=kept,
         observed=observed,

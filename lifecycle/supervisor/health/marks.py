@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 import msgspec
 
 from lifecycle.codec import DscpValue, from_json, to_json
-from lifecycle.network.medium import Medium
+from lifecycle.network.medium import UDP_UNICAST
 from lifecycle.network.nfe import is_multicast
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import ArrivedMark
@@ -33,7 +33,6 @@ Ports = tuple[int, int]
 _ECN_BITS = 2
 _LONGEST = 256
 _READ_AT_ONCE = 64
-_CARRIERS = (Medium.UDPV4, Medium.UDPV6)
 _FAMILIES = {
     socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS, socket.IP_RECVTOS),
     socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS, socket.IPV6_RECVTCLASS),
@@ -145,7 +144,7 @@ class Marks:
             found, other = (to, subscribes) if publishes in own else (due, publishes)
             found.update(
                 _Way(other, each.dscp, each.destination_address)
-                for each in (flow.tuples if flow.effective_transport in _CARRIERS else ())
+                for each in (flow.tuples if flow.effective_transport in UDP_UNICAST else ())
                 if each.dscp and not is_multicast(each.destination_address)
             )
         self._to = to

@@ -137,7 +137,7 @@ def test_a_delay_is_judged_after_200_messages_or_5_s() -> None:
 
 
 def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
-    slow = [(at_s, 8.0 if number % 20 == 0 else 1.0, number) for at_s, _, number in steady(100, 2)]
+    slow = [(at_s, 8.0 if number % 30 == 0 else 1.0, number) for at_s, _, number in steady(100, 2)]
     assert verdict(DELAY, counted(slow, until_s=2)) is False
     assert verdict(Bound(kind=Kind.DELAY, most=5.0, quantile=0.9), counted(slow, until_s=2)) is True
     later = [(at_s + 2, delay, number + 200) for at_s, delay, number in steady(100, 2)]
@@ -147,12 +147,13 @@ def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("late", "kept"), [(2, True), (3, None), (too_many_late(200, 0.01) - 1, None), (7, False)]
+    ("late", "kept"),
+    [(1, True), (2, None), (too_many_late(75, 0.01) - 1, None), (too_many_late(75, 0.01), False)],
 )
-def test_late_messages_that_may_be_chance_decide_nothing(late: int, kept: bool | None) -> None:
-    delays = ((at_s, number, 99 < number < 100 + late) for at_s, _, number in steady(100, 2))
+def test_a_few_late_messages_of_not_many_decide_nothing(late: int, kept: bool | None) -> None:
+    delays = ((at_s, number, 9 < number < 10 + late) for at_s, _, number in steady(15, 5))
     some = [(at_s, 8.0 if is_late else 1.0, number) for at_s, number, is_late in delays]
-    found = judge(DELAY, counted(some, until_s=2))
+    found = judge(DELAY, counted(some, until_s=5))
     assert (found.kept, found.needs_clocks, found.decides_in_s) == (kept, False, None)
 
 
