@@ -92,8 +92,7 @@ class FakeRosInterface:
     """What ROS programs see of a supervisor.
 
     Attributes:
-        statuses: published so far.
-        diagnostics: published so far; each a list of entries.
+        statuses: published so far; `diagnostics`: likewise, each a list of entries.
     """
 
     def __init__(
@@ -102,12 +101,10 @@ class FakeRosInterface:
         services: tuple[str, ...],
         on_call: Callable[[str, Callable[[bool, str], None]], None],
     ) -> None:
-        self.prefix = prefix
-        self.services = services
+        self.prefix, self.services = prefix, services
         self.statuses: list[str] = []
         self.diagnostics: list[tuple[Entry, ...]] = []
         self.destroyed = False
-        self.diagnoses = True
         self._on_call = on_call
 
     async def call(self, name: str) -> tuple[bool, str]:
@@ -138,13 +135,11 @@ class FakeParticipant:
         pids: of the processes that `others` run in, where they are known.
         twice: names that several nodes carry.
         services: of the nodes in `others`.
-        changes: so far.
-        dropped: nodes whose reports were forgotten.
+        changes: so far; `looks`: how often it was looked.
+        dropped: nodes whose reports were forgotten; `forgotten`: processes that were.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         no_ros: why it cannot be made; empty if it can.
-        refuses: value of a parameter that no node takes, `rate=5`.
-        refuses_live: why nodes do not take parameters while they run.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
@@ -154,13 +149,12 @@ class FakeParticipant:
         self.unseen: set[str] = set()
         self.mute: set[str] = set()
         self.services = FakeServices(self, hosts)
-        self.changes = 0
+        self.changes = self.looks = 0
         self.dropped: list[str] = []
+        self.forgotten: list[int] = []
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
         self.no_ros = ""
-        self.refuses = ""
-        self.refuses_live: dict[str, str] = {}
         self.graph = self.discovery = self.settling = self.state = self
         self.clients = self.services
         self._hosts = hosts
@@ -191,7 +185,9 @@ class FakeParticipant:
         only: Collection[str] | None = None,
         machines: Collection[str] | None = None,
     ) -> Observation:
-        del plan, only, machines
+        del only, machines
+        self.looks += 1
+        self.asked = [each.key for each in plan.nodes]
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(
@@ -228,7 +224,7 @@ class FakeParticipant:
         self._reports.pop(node, None)
 
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
-        """Nothing is left in this graph."""
+        self.forgotten.append(pid)
 
     def watch_alive(self, topic: str, **callbacks: object) -> _Connection:
         del topic, callbacks
@@ -249,8 +245,8 @@ class FakeParticipant:
         assert self.ros is None
         if self.no_ros:
             raise MiddlewareError(self.no_ros)
+        del diagnoses
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
-        self.ros.diagnoses = diagnoses
         return self.ros
 
     def send_again_soon(self) -> None:
@@ -273,14 +269,17 @@ _REACHED = {
 
 
 class FakeServices:
-    """The lifecycle services of the nodes that others run.
+    """The lifecycle services of the nodes that others run, and the parameters of all.
+
+    What is asked is in the log of the hosts, `/base activate`, `/base set {'rate': 1.0}`, and takes
+    as long, and fails, as is said of such a line there: for a transition before it leaves.
 
     Attributes:
-        matched_after_s: of a request, as `/base activate`: seconds before it can leave.
+        moved_to: states that somebody moves a node to right after each of the first requests.
     """
 
     def __init__(self, graph: FakeParticipant, hosts: FakeForkServer) -> None:
-        self.matched_after_s: dict[str, float] = {}
+        self.moved_to: list[str] = []
         self._graph = graph
         self._hosts = hosts
 
@@ -293,27 +292,24 @@ class FakeServices:
         return True
 
     async def give_parameters(self, node: PlannedNode) -> None:
-        """Note what is set; a node may refuse."""
         given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
-        self._hosts.log.append(f"{node.full_name} given {given}")
-        if self._graph.refuses in given.split():
-            raise MiddlewareError(f"cannot set {self._graph.refuses!r}")
+        await self._take(f"{node.full_name} given {given}")
 
     async def set_parameters(
         self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
     ) -> None:
         assert values.keys() == types.keys()
-        self._hosts.log.append(f"{node} set {values}")
-        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
-        if node in self._graph.refuses_live:
-            raise MiddlewareError(self._graph.refuses_live[node])
+        await self._take(f"{node} set {values}")
+
+    async def _take(self, line: str) -> None:
+        self._hosts.log.append(line)
+        if line in self._hosts.ways:
+            raise MiddlewareError(self._hosts.ways[line])
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
-        del timeout_s
         return self._graph.others[node]
 
     async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
-        del node, timeout_s
         return tuple(_REACHED)
 
     async def change_state(
@@ -324,17 +320,16 @@ class FakeServices:
         timeout_s: float,
         before: Callable[[], Awaitable[None]] | None = None,
     ) -> bool:
-        del timeout_s
-        await asyncio.sleep(self.matched_after_s.get(f"{node} {transition}", 0.0))
+        await asyncio.sleep(self._hosts.takes_s.get(f"{node} {transition}", 0.0))
         if before is not None:
             await before()
         self._hosts.log.append(f"{node} {transition}")
-        self._graph.others[node] = _REACHED[transition]
+        moved = self.moved_to.pop(0) if self.moved_to else _REACHED[transition]
+        self._graph.others[node] = moved
         self._graph.note()
         return True
 
     async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
-        del node, timeout_s
         return None
 
     async def wire(self, node: str, *asked: object, timeout_s: float) -> None:
@@ -342,31 +337,27 @@ class FakeServices:
 
 
 class FakeNetworks(Networks):
-    """Networks that take their time, and may fail.
+    """Networks that take as long as hosts do for `networks programmed`, and fail as is said there.
 
-    Attributes:
-        takes_s: seconds to program them.
-        fails: why they cannot be programmed; empty while they can.
+    Args:
+        hosts: have the log.
     """
 
-    def __init__(self, log: list[str]) -> None:
-        self.takes_s = 0.0
-        self.fails = ""
-        self._log = log
+    def __init__(self, hosts: FakeForkServer) -> None:
+        self._hosts = hosts
 
     def replan(self, plan: Plan) -> None:
         """What it programs is of no account."""
 
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
-        del timeout_s
-        self._log.append(f"networks programmed ({verdict.verdict.value})")
-        await asyncio.sleep(self.takes_s)
-        if self.fails:
-            raise BringUpError(self.fails)
+        what = "networks programmed"
+        self._hosts.log.append(f"{what} ({verdict.verdict.value})")
+        await asyncio.sleep(self._hosts.takes_s.get(what, 0.0))
+        if what in self._hosts.ways:
+            raise BringUpError(self._hosts.ways[what])
 
     async def close(self, hurry: asyncio.Event) -> None:
-        del hurry
-        self._log.append("networks restored")
+        self._hosts.log.append("networks restored")
 
 
 class _Story(list[str]):
@@ -452,7 +443,6 @@ class SessionWorld:
             all events in brackets, in the order in which they happened.
         hosts: start, and obey or not, as they are told.
         graph: what discovery shows beside the nodes of the hosts.
-        networks: to be programmed.
         result: of the run; None before its end.
         status: gives what `lifecycle status` shows; during the run.
         supervisor: likewise.
@@ -466,7 +456,6 @@ class SessionWorld:
         self.hosts = FakeForkServer()
         self.hosts.log = self.story
         self.graph = FakeParticipant(self.hosts)
-        self.networks = FakeNetworks(self.story)
         self.ending = Ending()
         self.result: UpResult | None = None
         self.status: Callable[[], SystemStatus]
@@ -524,7 +513,7 @@ class SessionWorld:
                 records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
-                networks=self.networks,
+                networks=FakeNetworks(self.hosts),
                 ending=self.ending,
             )
             session = self.supervisor = Supervisor(self.system, self._options, means)
@@ -597,6 +586,11 @@ class SessionWorld:
         self.graph.others["/intruder"] = ""
         self.graph.note()
 
+    def hide(self, *nodes: str) -> None:
+        """Hide nodes from the graph, as behind a link that is cut; none: show all again."""
+        self.graph.unseen = set(nodes)
+        self.graph.note()
+
     def double(self, *nodes: str) -> None:
         """Let nodes be there two times, which violates what is declared of them; none: once."""
         self.graph.twice = set(nodes)
@@ -661,16 +655,14 @@ class SessionWorld:
                 assert verdict in ("ok", "unverifiable"), f"{kind} was activated on {verdict}"
 
 
-def connected_by(*urls: str) -> ParticipantConnections:
-    """How a node's own participant is connected."""
-    return ParticipantConnections(urls=urls)
-
-
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
 
+_URLS = ("tcpv4://127.0.0.1:7911", "tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")
 DIALLING = plan_of(
-    replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
-    replace(CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")),
+    *(
+        replace(node, connections=ParticipantConnections(urls=(url,)))
+        for node, url in zip(CHAIN.nodes, _URLS, strict=True)
+    )
 )
 """The same by TCP alone: `viewer` gets another port when it is started again."""
 
@@ -707,10 +699,6 @@ ATTACHED = plan_of(
 CHANGED = "the system changed before every node was activated"
 
 REFUSED = """cannot activate: the verdict is violated
-  graph.undeclared-node: the manifest does not declare node /intruder"""
-
-REFUSED_AGAIN = """cannot activate: the system changed before every node was activated, and its \
-verdict now is violated
   graph.undeclared-node: the manifest does not declare node /intruder"""
 
 INTRUDED = "graph.undeclared-node /intruder"

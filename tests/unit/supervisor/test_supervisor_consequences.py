@@ -15,14 +15,13 @@ from lifecycle.manifest.model import (
     Condition,
     Consequence,
     Health,
-    Mode,
     OnViolation,
     Reaction,
     Supervision,
 )
 from lifecycle.manifest.model import Restart as RestartWhen
 from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.plan.model import Plan, in_mode
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.core.consequences import reaction_of
 from lifecycle.supervisor.core.state import Level
@@ -31,8 +30,8 @@ from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
-from tests.builders import HERE, configuration, plan_of, planned_node
-from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
+from tests.builders import configuration, plan_of, planned_node
+from tests.unit.supervisor.session_world import DOWN, SessionWorld
 
 REPORT, DEACTIVATE, MODE, PAUSE, STOP = Consequence
 Said = tuple[tuple[str, Consequence], ...]
@@ -128,29 +127,6 @@ async def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(
     assert world.story[-1] == "[stopped] 4"
 
 
-async def test_what_passes_has_no_consequence(tmp_path: Path) -> None:
-    world = SessionWorld(_plan((("default", STOP),)), tmp_path, stop_after_s=5.0)
-    async with world.running("[system] active"):
-        for _ in range(3):
-            world.double("/camera")
-            await asyncio.sleep(0.3)
-            world.double()
-            await asyncio.sleep(0.3)
-    assert world.story[-1] == "[stopped] 0"
-
-
-async def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Path) -> None:
-    world = SessionWorld(_plan(((TWICE, STOP), ("default", PAUSE))), tmp_path)
-    async with world.running("[system] active"):
-        world.double("/viewer")
-    assert world.since("[consequence]") == [
-        f"[consequence] stop  for {TWICE}",
-        f"[stopping] at 0.5 s: on_violation: stop ({TWICE} of /viewer)",
-        *DOWN,
-        *over(4),
-    ]
-
-
 async def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Path) -> None:
     plan = _plan((("graph", DEACTIVATE),))
     world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
@@ -169,88 +145,6 @@ async def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Pa
         "[system] paused at 0.5 s",
     ]
     assert len([each for each in world.outline if each.startswith("[consequence]")]) == 1
-
-
-async def test_a_node_in_restart_has_no_consequence_and_one_withheld_comes_back_inactive(
-    tmp_path: Path,
-) -> None:
-    plan = _plan((("default", STOP), (TWICE, DEACTIVATE)), restart=RestartWhen.ON_FAILURE)
-    world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
-    async with world.running("[system] active"):
-        world.kill("camera")
-        await world.story.until("[restarted] camera (1)")
-        await asyncio.sleep(1.0)
-        world.double("/camera")
-        await world.story.until("[consequence]")
-        await asyncio.sleep(1.0)
-        world.double()
-        world.kill("camera")
-        await world.story.until("[restarted] camera (2)")
-        await asyncio.sleep(1.0)
-        assert world.status().phase == "held"
-        assert await world.order(ControlRequest.RESUME) == "0"
-    assert world.outline.count("/camera activate") == 3
-    assert world.outline.count("/viewer activate") == 1
-    assert world.story[-1] == "[stopped] 4"
-
-
-async def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(
-    tmp_path: Path,
-) -> None:
-    plan = plan_of(
-        replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
-        planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
-    )
-    world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
-    async with world.running("[system] active"):
-        world.double("/camera")
-        await world.story.until("[node] /camera connected (inactive)", 2)
-        world.double()
-        world.kill("viewer")
-        began = asyncio.get_running_loop().time()
-        await world.story.until("[restarted] viewer (1)")
-        assert asyncio.get_running_loop().time() - began < 2.0
-        camera, viewer = world.status().nodes
-        assert world.status().phase == "held"
-        assert (camera.state, viewer.state) == ("inactive", "active")
-        assert await world.order(ControlRequest.RESUME) == "0"
-        assert world.status().phase == "active"
-    assert not [each for each in world.outline if each.startswith("[failure] run.transition")]
-
-
-async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_again(
-    tmp_path: Path,
-) -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    plan = replace(
-        plan,
-        modes=(
-            Mode(name="normal", inactive=("viewer",), at=HERE),
-            Mode(name="safe", inactive=("camera", "viewer"), at=HERE),
-            Mode(name="other", inactive=("camera",), at=HERE),
-        ),
-        on_violation=(
-            Reaction(rule=TWICE, what=MODE, mode="safe"),
-            Reaction(rule="graph.undeclared-node", what=MODE, mode="other"),
-        ),
-    )
-    world = SessionWorld(in_mode(plan, "normal"), tmp_path, stop_after_s=20.0)
-    async with world.running("[system] active"):
-        world.double("/camera")
-        await world.story.until("[mode] safe")
-        await asyncio.sleep(3.0)
-        assert (world.status().mode, world.status().phase) == ("safe", "active")
-        world.double()
-        assert await world.order(ControlRequest.MODE, mode="normal") == "0"
-        world.intrude()
-        await world.story.until("[notice] cannot enter mode 'other': back to 'normal'")
-        await asyncio.sleep(3.0)
-        assert (world.status().mode, world.status().phase) == ("normal", "held")
-    taken = [each for each in world.outline if each.startswith("[consequence]")]
-    assert taken == [
-        f"[consequence] mode  for {TWICE}",
-        "[consequence] mode  for graph.undeclared-node",
-    ]
 
 
 async def test_what_a_node_said_of_its_health_while_it_was_inactive_is_no_answer(

@@ -16,18 +16,15 @@ from lifecycle.manifest.model import (
     Mode,
     OnFailure,
     Reaction,
-    Restart,
     RunKind,
-    Supervision,
 )
-from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan
+from lifecycle.plan.model import ExpectedParameter, ModeParameters
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
     Failure,
-    GaveUp,
     ManifestApplied,
     Restarted,
     SystemReached,
@@ -35,20 +32,8 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
-from tests.unit.supervisor.core.playbook import Play
+from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, GONE, INTRUDER, Play, chain
 from tests.unit.supervisor.core.world import READY, verdict
-
-AGAIN = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
-CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
-INTRUDER = ("graph.undeclared-node", "/intruder")
-GONE = ("graph.missing-node", "/camera")
-
-
-def chain(camera: Supervision = AGAIN, viewer: Supervision = AGAIN) -> Plan:
-    return plan_of(
-        planned_node("camera", supervision=camera),
-        planned_node("viewer", supervision=viewer, after={"camera": Condition.ACTIVE}),
-    )
 
 
 def down(node: str, *, active: bool = True) -> list[str]:
@@ -257,14 +242,6 @@ def test_a_node_that_crashed_comes_again_through_its_gate_and_what_it_left_is_sw
     assert play.code == 0
 
 
-def test_a_process_that_fails_again_and_again_is_given_up() -> None:
-    how = msgspec.structs.replace(AGAIN, start_limit_burst=2, start_limit_interval_sec=60.0)
-    play = Play(chain(how), ways={"camera configure": "no device"})
-    play.wait(3.0)
-    assert sum(isinstance(each, GaveUp) for each in play.events) == 1
-    assert play.code == 7
-
-
 def test_dependents_go_down_in_order_and_come_again_with_it() -> None:
     play = Play(chain(msgspec.structs.replace(AGAIN, on_failure=OnFailure.DEPENDENTS)))
     assert play.die("camera")[-2:] == ["signal viewer 0", "sweep viewer"]
@@ -275,12 +252,12 @@ def test_dependents_go_down_in_order_and_come_again_with_it() -> None:
 def test_a_death_ends_the_run_unless_it_is_to_keep_going() -> None:
     play = Play(CHAIN)
     play.die("camera")
-    assert play.code == 6
-    play = Play(CHAIN, keep_going=True)
+    assert (play.code, play.reason) == (6, "failed: /camera (run.process-died)")
+    play = Play(CHAIN, keep_going=True, hold_s=10.0)
     play.die("camera")
     assert play.levels == "0 4"
-    play.down()
-    assert play.code == 6
+    play.wait(10.0)
+    assert (play.code, play.reason) == (6, "done, but failed: /camera (run.process-died)")
 
 
 def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not() -> None:
@@ -304,14 +281,21 @@ def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
     assert play.answers[1][0] is ExitCode.VIOLATED
 
 
-@pytest.mark.parametrize(("lasts_s", "code"), [(2.0, 4), (0.2, 0)])
-def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int) -> None:
+@pytest.mark.parametrize(
+    ("lasts_s", "code", "why"),
+    [
+        (2.0, 4, "done, but violated meanwhile, wrong"),
+        (0.2, 0, "done; violated for no longer than 1 s, and not counted"),
+        (20.0, 4, "done, but violated; wrong"),
+    ],
+)
+def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, why: str) -> None:
     play = Play(CHAIN, hold_s=10.0)
     play.see(INTRUDER)
     play.wait(lasts_s)
     play.see()
     play.wait(10.0)
-    assert play.code == code
+    assert (play.code, play.reason) == (code, f"{why}: /intruder (graph.undeclared-node)")
 
 
 # Orders
@@ -477,6 +461,9 @@ def test_a_violation_that_lasts_has_its_consequence(what: Consequence, asked: li
     found = play.wait(1.0)
     assert found[: len(asked)] == asked
     assert (play.run.ending is not None) == (what is Consequence.STOP)
+    if what is Consequence.STOP:
+        why = "on_violation: stop (graph.undeclared-node of /intruder)"
+        assert (play.code, play.reason.partition(";")[0]) == (4, why)
 
 
 def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resumed() -> None:
