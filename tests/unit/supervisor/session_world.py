@@ -20,13 +20,15 @@ from collections.abc import (
     Mapping,
 )
 from pathlib import Path
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any
 
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
+from lifecycle.middleware.discovery.liveliness import Received
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
 from lifecycle.run_directory import RunDirectory, short_path
@@ -38,11 +40,9 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
 )
 from lifecycle.supervisor.control.ros_interface import Entry
-from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
-    Emitter,
     Event,
     Failure,
     GateOpened,
@@ -70,22 +70,57 @@ from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeForkServer, interface_of
-
-E = TypeVar("E", bound=Event)
+from tests.unit.supervisor.fakes import FakeForkServer, World, interface_of
 
 SHUTDOWN_S = 30.0
 """However a node or a process resists, a system of the size of these is down within so long."""
 
 
-class _Connection:
-    """Carries nothing: no other supervisor is in this world."""
+class FakeAir:
+    """Carries nothing to other supervisors, and remembers what was announced and watched."""
 
-    def destroy(self) -> None:
-        """Nothing to destroy."""
+    def __init__(self) -> None:
+        self.watched: dict[str, SimpleNamespace] = {}
+        self.announced: dict[str, list[Mapping[str, str]]] = {}
+        self.received: list[Received] = []
+        self.plans: list[str] = []
+        self.arrives: Callable[[str], None] | None = None
+        self.done: list[str] = []
+
+    def announce_alive(self, topic: str) -> SimpleNamespace:
+        said = self.announced.setdefault(topic, [])
+
+        def notify(silent: Mapping[str, str], received: Received) -> None:
+            said.append(dict(silent))
+            self.received.append(dict(received))
+
+        return SimpleNamespace(notify=notify, destroy=lambda: None)
+
+    def watch_alive(self, topic: str, **callbacks: Callable[..., None]) -> SimpleNamespace:
+        self.watched[topic] = SimpleNamespace(
+            alive=callbacks["on_liveliness"],
+            left=callbacks["on_left"],
+            silent=callbacks["on_notice"],
+            times=callbacks["on_times"],
+            destroy=lambda: self.watched.pop(topic),
+        )
+        return self.watched[topic]
+
+    def plan_notices(self, on_notice: Callable[[str], None]) -> FakeAir:
+        self.arrives = on_notice
+        return self
 
     def announce(self, text: str) -> None:
-        """Nobody reads it."""
+        self.plans.append(text)
+
+    def destroy(self) -> None:
+        self.arrives = None
+
+    def send_again_soon(self) -> None:
+        self.done.append("send_again_soon")
+
+    def republish_names(self) -> None:
+        self.done.append("republish_names")
 
 
 class FakeRosInterface:
@@ -125,7 +160,7 @@ class FakeRosInterface:
         self.destroyed = True
 
 
-class FakeParticipant:
+class FakeParticipant(FakeAir):
     """Sees the nodes of the fake hosts, and those that others run; reaches the latter.
 
     Attributes:
@@ -143,6 +178,7 @@ class FakeParticipant:
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
+        super().__init__()
         self.others: dict[str, str] = {}
         self.pids: dict[str, int] = {}
         self.twice: set[str] = set()
@@ -226,14 +262,6 @@ class FakeParticipant:
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         self.forgotten.append(pid)
 
-    def watch_alive(self, topic: str, **callbacks: object) -> _Connection:
-        del topic, callbacks
-        return _Connection()
-
-    def plan_notices(self, on_notice: Callable[[str], None]) -> _Connection:
-        del on_notice
-        return _Connection()
-
     def ros_interface(
         self,
         prefix: str,
@@ -248,12 +276,6 @@ class FakeParticipant:
         del diagnoses
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
         return self.ros
-
-    def send_again_soon(self) -> None:
-        """No link is ever lost."""
-
-    def republish_names(self) -> None:
-        """No name is ever forgotten."""
 
     def prepare_to_leave(self) -> None:
         """Everybody answers."""
@@ -435,7 +457,7 @@ def _line(event: Event, now_s: float) -> str:
     return f"[{event.kind}] {said}".removesuffix(" ()").rstrip()
 
 
-class SessionWorld:
+class SessionWorld(World):
     """One session with all that it acts on; make it, prepare it, `run` it once.
 
     Attributes:
@@ -447,32 +469,24 @@ class SessionWorld:
         status: gives what `lifecycle status` shows; during the run.
         supervisor: likewise.
         prepare: called once that is made, before it runs.
-        events: so far.
     """
 
     def __init__(self, plan: Plan, tmp_path: Path, **options: Any) -> None:
-        loop = asyncio.get_running_loop()
-        self.story = _Story()
-        self.hosts = FakeForkServer()
-        self.hosts.log = self.story
+        (tmp_path / "logs").mkdir()
+        super().__init__(plan, tmp_path / "logs")
+        self.story = self.hosts.log = _Story()
         self.graph = FakeParticipant(self.hosts)
         self.ending = Ending()
         self.result: UpResult | None = None
         self.status: Callable[[], SystemStatus]
         self.supervisor: Supervisor
         self.prepare: Callable[[], None] = lambda: None
-        self.events: list[Event] = []
         self._stopping_at_s: float | None = None
         self._tmp_path = tmp_path
-        self._emit = Emitter(loop.time)
-        self._emit.listen(self._take)
+        self.emit.listen(self._take)
         self.journal = Journal("robot", "0", say=self.story.append)
-        self._emit.listen(self.journal.on_event)
+        self.emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
-        (tmp_path / "logs").mkdir()
-        self.system = System(
-            plan, emit=self._emit, logs=tmp_path / "logs", processes=plan.processes
-        )
         for node in plan.nodes:
             if node.run.kind is RunKind.ATTACH:
                 self.graph.others[node.full_name] = "unconfigured"
@@ -591,11 +605,6 @@ class SessionWorld:
         self.graph.unseen = set(nodes)
         self.graph.note()
 
-    def double(self, *nodes: str) -> None:
-        """Let nodes be there two times, which violates what is declared of them; none: once."""
-        self.graph.twice = set(nodes)
-        self.graph.note()
-
     def retreat(self) -> None:
         """Let the intruder leave."""
         del self.graph.others["/intruder"]
@@ -605,15 +614,10 @@ class SessionWorld:
         """Let a process end as by a crash."""
         self.hosts.processes[process].end(ProcessExit(signal=signal.SIGSEGV))
 
-    def heard(self, kind: type[E]) -> list[E]:
-        """Events of one kind."""
-        return [each for each in self.events if isinstance(each, kind)]
-
     def _take(self, event: Event) -> None:
-        self.events.append(event)
         if isinstance(event, Stopping):
-            self._stopping_at_s = self._emit.elapsed_s
-        self.story.append(_line(event, self._emit.elapsed_s))
+            self._stopping_at_s = self.emit.elapsed_s
+        self.story.append(_line(event, self.emit.elapsed_s))
 
     def _check(self) -> None:
         """What holds in every run."""
@@ -625,7 +629,7 @@ class SessionWorld:
         assert self.story.count("networks restored") == 1
         assert all(each.exited.done() for each in self.hosts.processes.values())
         assert self._stopping_at_s is not None
-        assert self._emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
+        assert self.emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()
         self._check_journal()
 

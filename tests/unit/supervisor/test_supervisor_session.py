@@ -17,8 +17,6 @@ import pytest
 from lifecycle.manifest.model import Condition, Restart, RunKind, Supervision, Timeouts
 from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.run.events import Failure
-from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
@@ -86,22 +84,6 @@ async def test_a_system_is_brought_up_along_its_order_held_and_taken_down_in_rev
     ]
 
 
-@pytest.mark.parametrize(
-    ("until", "before", "how"),
-    [
-        (Until.CONNECTED, ["[verdict] connected ok"], "connected, before it was verified"),
-        (Until.VERIFIED, VERIFIED[:2], "verified, before it was active"),
-    ],
-)
-async def test_a_system_that_is_not_to_be_active_gets_no_activate_request(
-    tmp_path: Path, until: Until, before: list[str], how: str
-) -> None:
-    world = SessionWorld(CHAIN, tmp_path, until=until)
-    await world.run()
-    assert world.outline == [*CONNECTED, *before, "[stopping] at 0.0 s: done", *BACK, *over(0)]
-    assert world.report == f"ended when {how}, exit code 0: done"
-
-
 FAILED, DIED = "run.transition-failed", "run.process-died"
 DEATH = "cannot keep '/viewer' running: pid 5000002 died while {}: killed by SIGSEGV"
 
@@ -143,34 +125,6 @@ async def test_a_node_in_which_a_step_fails_has_everything_rolled_back(
     place = "when verified, before it was active" if was_active else "before it was connected"
     assert world.report == f"ended {place}, exit code 6: failed: /viewer ({failure})"
     assert world.messages == [message]
-
-
-async def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other(
-    tmp_path: Path,
-) -> None:
-    nodes = (*(planned_node(key, process="all") for key in "abc"), planned_node("d"))
-    world = world_of(tmp_path, *nodes)
-    error = "ModuleNotFoundError: No module named 'camera_driver'"
-    world.hosts.unhosted["all"] = {"/b": error, "/c": "cannot import 'm:C': no module 'm'"}
-    world.hosts.takes_s["d start"] = 60.0
-    await world.run()
-    assert [(each.rule, each.subject, each.message) for each in world.heard(Failure)] == [
-        ("run.start-failed", "/b", f"cannot start '/b': {error}"),
-        ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
-    ]
-
-
-async def test_a_plain_command_is_only_started_and_whoever_needs_it_waits_for_its_name(
-    tmp_path: Path,
-) -> None:
-    plain = planned_node("plain", kind=RunKind.COMMAND, managed=False)
-    world = world_of(tmp_path, plain, planned_node("a", after={"plain": Condition.CONFIGURED}))
-    world.hosts.takes_s["plain start"] = 3.0
-    async with world.running("a start"):
-        await asyncio.sleep(1.0)
-        assert "/a configure" not in world.story
-    assert "[system] connected at 3.0 s" in world.outline
-    assert "plain SIGINT" in world.story
 
 
 @pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
@@ -456,18 +410,6 @@ async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Pa
         world.hosts.ways.clear()
 
 
-async def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_path: Path) -> None:
-    world = SessionWorld(PAIR, tmp_path, stop_after_s=20.0)
-    async with world.running("[system] active"):
-        process = world.system.processes["camera"]
-        for hangs_s in (2.0, 10.0):
-            process.on_stop(True)
-            await asyncio.sleep(hangs_s)
-            process.on_stop(False)
-    ends = ("camera SIGKILL", "[backoff] camera in 1.0 s")
-    assert [each for each in world.story if each in ends] == [*ends]
-
-
 async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
     tmp_path: Path,
 ) -> None:
@@ -596,11 +538,3 @@ async def test_nodes_and_processes_that_resist_are_ended_within_limits(tmp_path:
         "[notice] process 'camera' had to be ended with SIGTERM",
         *over(0),
     ]
-
-
-async def test_what_escaped_is_ended_and_named(tmp_path: Path) -> None:
-    world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
-    world.hosts.strays = (4711, 4712)
-    await world.run()
-    said = "[notice] ended processes that were left behind: 4711, 4712"
-    assert world.outline[-3:] == ["networks restored", said, "[stopped] 0"]

@@ -12,6 +12,9 @@ from lifecycle.manifest.model import (
     Consequence,
     EndpointPolicy,
     Mode,
+    ModeParameter,
+    OnViolation,
+    ParameterDeclaration,
     Policy,
     Reaction,
     Restart,
@@ -19,13 +22,14 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ControlRequest
+from lifecycle.supervisor.core.consequences import reaction_of
 from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
     ManifestApplied,
     Notice,
     Restarted,
 )
-from tests.builders import HERE, plan_of, planned_node
+from tests.builders import HERE, node, plan_of, planned, planned_node
 from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, GONE, INTRUDER, Play, chain
 from tests.unit.supervisor.core.world import verdict
 
@@ -88,14 +92,6 @@ def test_a_manifest_that_fails_is_taken_back_and_what_did_not_differ_is_not_touc
     play.ways.clear()
     play.order(RESTART)
     assert (play.answers[1][0], play.levels) == (0, "4 4")
-
-
-def test_what_differs_in_a_process_is_restarted_alone() -> None:
-    play = Play(CHAIN)
-    asked = play.order(APPLY, plan=plan_of(CAMERA, LOUD))
-    assert "spawn viewer" in asked
-    assert not [each for each in asked if "camera" in each]
-    assert [each.stage for each in play.heard(ManifestApplied)] == ["begun", "applied"]
 
 
 def test_a_gate_that_stays_closed_activates_nothing_and_takes_the_manifest_back() -> None:
@@ -355,6 +351,32 @@ def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(seed: int) -
 
 # Another mode
 
+
+def test_a_mode_keeps_its_nodes_inactive_and_the_next_has_them_active_again() -> None:
+    plan = modes("normal", "degraded", "blind")
+    assert in_mode(plan, "normal").nodes == plan.nodes
+    degraded = in_mode(plan, "degraded")
+    assert [each.state.value for each in degraded.nodes] == ["active", "inactive"]
+    assert degraded.nodes[0] is plan.nodes[0]
+    blind = in_mode(degraded, "blind")
+    assert [each.state.value for each in blind.nodes] == ["inactive", "active"]
+    assert in_mode(blind, "unknown") is blind
+
+
+def test_a_mode_has_parameters_and_the_next_has_them_as_they_are_declared() -> None:
+    speed = ParameterDeclaration(name="speed", type="double", default=1.0, at=HERE)
+    base = node("base")
+    base = replace(base, interface=replace(base.interface, parameters=(speed,)))
+    given = ModeParameter(node="base", name="speed", value=0.2, at=HERE)
+    slow = Mode(name="slow", inactive=("camera",), parameters=(given,), at=HERE)
+    plan = planned(base, node("camera"), modes=(Mode(name="normal", at=HERE), slow))
+    assert plan.nodes[0].parameters == (("speed", 1.0),)
+    (expected,) = in_mode(plan, "slow").nodes[0].expected_parameters
+    assert (expected.name, expected.value, expected.source) == ("speed", 0.2, "mode slow")
+    assert in_mode(plan, "slow").nodes[0].parameters == (("speed", 0.2),)
+    assert in_mode(in_mode(plan, "slow"), "normal") == plan
+
+
 BLIND = Mode(name="blind", inactive=("base",), at=HERE)
 DEGRADED = Mode(name="degraded", inactive=("camera",), at=HERE)
 
@@ -406,6 +428,37 @@ def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_its_mo
 
 DEACTIVATE = Consequence.DEACTIVATE
 DIFFERS = ("param.value-differs", "/camera")
+
+
+REPORT, _, _, QUIET, STOP = Consequence
+TWICE = "graph.duplicate-node"
+
+
+@pytest.mark.parametrize(
+    ("system", "camera", "found"),
+    [
+        ({}, {}, REPORT),
+        ({"default": STOP}, {}, STOP),
+        ({"default": STOP, "graph": QUIET}, {}, QUIET),
+        ({"graph": QUIET, TWICE: DEACTIVATE}, {}, DEACTIVATE),
+        ({TWICE: STOP}, {"default": REPORT}, REPORT),
+        ({"graph": STOP}, {"param": REPORT}, STOP),
+    ],
+)
+def test_what_is_nearest_counts_and_of_two_ends_the_stronger_one(
+    system: dict[str, Consequence], camera: dict[str, Consequence], found: Consequence
+) -> None:
+    def said(pairs: dict[str, Consequence]) -> OnViolation:
+        return tuple(Reaction(rule=rule, what=what) for rule, what in pairs.items())
+
+    plan = plan_of(replace(CAMERA, on_violation=said(camera)), VIEWER)
+    plan = replace(plan, on_violation=said(system))
+    (finding,) = verdict((TWICE, "/camera")).findings
+    assert reaction_of(plan, finding).what is found
+    stops = replace(VIEWER, on_violation=said({"default": STOP}))
+    plan = replace(plan, nodes=(plan.nodes[0], stops))
+    (pair,) = verdict((TWICE, "/video: /camera → /viewer")).findings
+    assert reaction_of(plan, pair).what is STOP
 
 
 def test_what_passes_has_no_consequence() -> None:

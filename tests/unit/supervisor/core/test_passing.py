@@ -43,6 +43,14 @@ def test_a_condition_holds_the_step_that_it_names_and_none_before(
     assert held in play.finish(step)
 
 
+def test_a_node_waits_until_another_is_healthy() -> None:
+    plan = plan_of(planned_node("a"), planned_node("b", after={"a": Condition.HEALTHY}))
+    play = Play(plan)
+    assert play.levels == "4 3"
+    play.give(inputs.Saw(health={"a": True}))
+    assert play.levels == "4 4"
+
+
 def test_nodes_of_one_process_share_it_and_its_start_waits_for_both() -> None:
     both = planned_node("b", process="both", after={"c": Condition.STARTED})
     plan = plan_of(planned_node("a", process="both"), both, planned_node("c"))
@@ -63,6 +71,7 @@ def test_who_waits_is_named_with_what_it_waits_for_when_it_dies_and_when_time_is
     play.wait(4.0)
     late = "cannot bring up 'robot' within 3 s: /camera is still configuring; /viewer waits to "
     assert play.failures == [("/camera", f"{late}configure until /camera is configured")]
+    assert play.heard(Failure)[0].process == "camera"
 
 
 def test_all_that_fails_side_by_side_is_named_and_no_other_step_begins() -> None:
@@ -93,6 +102,16 @@ def test_processes_that_die_one_after_the_other_are_all_named() -> None:
     play.wait(ALSO_S)
     assert [each.subject for each in play.heard(Failure)] == ["/a", "/b"]
     assert play.reason == "failed: /a (run.process-died), /b (run.process-died)"
+
+
+def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other() -> None:
+    play = Play(plan_of(*(planned_node(key, process="all") for key in "abc")), {"a start": "hang"})
+    reports = (("/b", "no module 'driver'"), ("/c", "cannot import 'm:C'"))
+    play.give(inputs.Exited(process="all", status=1, text="gone", reports=reports))
+    assert play.failures == [
+        ("/b", "cannot start '/b': no module 'driver'"),
+        ("/c", "cannot import 'm:C'"),
+    ]
 
 
 @pytest.mark.parametrize("kind", [RunKind.PYTHON, RunKind.COMMAND])

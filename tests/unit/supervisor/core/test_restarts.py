@@ -160,15 +160,6 @@ def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_d
     assert play.code == 7
 
 
-def test_a_node_that_fails_to_activate_comes_again_and_what_is_active_stays_so() -> None:
-    play = Play(chain(), ways={"viewer activate": "die"})
-    assert play.levels == "4 0"
-    play.ways.clear()
-    play.wait(1.0)
-    assert (play.levels, _restarted(play)) == ("4 4", ["viewer"])
-    assert play.story.count("camera activate") == 1
-
-
 def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate() -> None:
     play = Play(chain())
     play.ways["camera configure"] = "hang"

@@ -25,7 +25,6 @@ from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
     Failure,
-    ManifestApplied,
     Restarted,
     SystemReached,
     VerdictChanged,
@@ -145,14 +144,6 @@ def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
     take(run, 0.0, inputs.Tick())
     take(run, 9.0, inputs.Tick())
     assert run.failures[0].message.endswith("within 2 s: nothing was started")
-
-
-def test_all_that_fails_within_a_moment_is_named() -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    play = Play(plan, ways={"camera configure": "no device", "viewer configure": "no display"})
-    named = [each.subject for each in play.events if isinstance(each, Failure)]
-    assert named == ["/camera", "/viewer"]
-    assert play.code == 6
 
 
 def test_a_step_that_hangs_is_late_and_its_time_without_a_processor_is_not_counted() -> None:
@@ -428,24 +419,6 @@ def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate() -> None:
     assert play.levels == "4 4"
 
 
-def test_a_manifest_is_applied_and_one_whose_node_fails_is_taken_back() -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    other = plan_of(planned_node("camera"), planned_node("arm"))
-    play = Play(plan)
-    play.order(ControlRequest.APPLY, plan=other)
-    assert sorted(play.run.nodes) == ["arm", "camera"]
-    assert play.levels == "4 4"
-    assert play.run.revision == 2
-    play.ways["viewer configure"] = "no display"
-    play.order(ControlRequest.APPLY, plan=plan)
-    assert [each[0] for each in play.answers.values()] == [0, ExitCode.BRING_UP_FAILED]
-    assert sorted(play.run.nodes) == ["arm", "camera"]
-    assert play.levels == "4 4"
-    assert play.run.revision == 2
-    stages = [each.stage for each in play.events if isinstance(each, ManifestApplied)]
-    assert stages == ["begun", "applied", "begun", "rolling_back", "rolled_back"]
-
-
 @pytest.mark.parametrize(
     ("what", "asked"),
     [
@@ -541,15 +514,6 @@ def test_a_mode_whose_parameters_a_node_refuses_is_left_again_with_the_node_s_re
     assert code == ExitCode.BRING_UP_FAILED
     assert "cannot enter mode 'night': rate is read-only" in error
     assert play.run.mode == "day"
-
-
-def test_a_bring_up_that_takes_too_long_names_the_node_that_it_waits_for_and_its_process() -> None:
-    play = Play(CHAIN, ways={"camera configure": "hang"}, timeout_s=3.0)
-    play.wait(4.0)
-    (failed,) = (each for each in play.events if isinstance(each, Failure))
-    assert (failed.subject, failed.process) == ("/camera", "camera")
-    play.wait(30.0)
-    assert play.code == ExitCode.BRING_UP_FAILED
 
 
 def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code() -> None:
