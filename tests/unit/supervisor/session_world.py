@@ -30,7 +30,7 @@ from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.middleware.discovery.liveliness import Received
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import (
@@ -42,13 +42,10 @@ from lifecycle.supervisor.control.protocol import (
 from lifecycle.supervisor.control.ros_interface import Entry
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
-    ConsequenceTaken,
     Event,
     Failure,
     GateOpened,
-    GaveUp,
     ManifestApplied,
-    ModeEntered,
     NodeChanged,
     NodeJoined,
     NodeLeft,
@@ -313,20 +310,11 @@ class FakeServices:
     def serves_parameters(self, node: str) -> bool | None:
         return True
 
-    async def give_parameters(self, node: PlannedNode) -> None:
-        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
-        await self._take(f"{node.full_name} given {given}")
-
     async def set_parameters(
         self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
     ) -> None:
         assert values.keys() == types.keys()
-        await self._take(f"{node} set {values}")
-
-    async def _take(self, line: str) -> None:
-        self._hosts.log.append(line)
-        if line in self._hosts.ways:
-            raise MiddlewareError(self._hosts.ways[line])
+        self._hosts.log.append(f"{node} set {values}")
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         return self._graph.others[node]
@@ -353,9 +341,6 @@ class FakeServices:
 
     async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
         return None
-
-    async def wire(self, node: str, *asked: object, timeout_s: float) -> None:
-        raise AssertionError(f"no authority wires {node}: {asked} {timeout_s}")
 
 
 class FakeNetworks(Networks):
@@ -414,12 +399,7 @@ _DETAIL = ("[process]", "[node]", "[request]", "[joined]", "[left]", "[log]")
 
 
 def _applied(event: ManifestApplied) -> str:
-    what = {
-        "added": event.added,
-        "removed": event.removed,
-        "restarted": event.restarted,
-        "parameters of": event.parameters,
-    }
+    what = {"added": event.added, "parameters of": event.parameters}
     said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
     return f"{event.stage} revision {event.revision}{said}"
 
@@ -443,10 +423,7 @@ _SAID: dict[type, Callable[[Any], str]] = {
     NodeLeft: lambda of: of.node,
     RestartScheduled: lambda of: f"{of.process} in {of.in_s:.1f} s",
     Restarted: lambda of: f"{of.process} ({of.restarts})",
-    GaveUp: lambda of: f"{of.process} ({len(of.history)} failures)",
-    ModeEntered: lambda of: f"{of.mode} without {' '.join(of.inactive)}".removesuffix(" without "),
     ManifestApplied: _applied,
-    ConsequenceTaken: lambda of: f"{of.action} {' '.join(of.nodes)} for {of.rule}",
 }
 
 

@@ -145,15 +145,6 @@ async def test_what_a_node_said_of_its_health_while_it_was_inactive_is_no_answer
     assert node.is_healthy
 
 
-async def test_a_silent_node_is_not_asked_for_and_is_judged_silent(tmp_path: Path) -> None:
-    world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
-    async with world.running("[system] active"):
-        await asyncio.sleep(1.0)
-        world.system.processes["camera"].on_stop(True)
-        await world.story.until("[verdict] active violated run.silent-node /camera")
-        assert world.graph.asked == ["viewer"]
-
-
 async def test_what_a_process_left_in_the_graph_counts_no_more(tmp_path: Path) -> None:
     plan = plan_of(planned_node("camera"), planned_node("viewer"))
     world = SessionWorld(plan, tmp_path, stop_after_s=5.0, keep_going=True)

@@ -91,6 +91,7 @@ DEATH = "cannot keep '/viewer' running: pid 5000002 died while {}: killed by SIG
 @pytest.mark.parametrize(
     ("step", "way", "failure", "message"),
     [
+        ("configure", "no lens", FAILED, "cannot configure '/viewer': no lens"),
         ("connect", "no display", FAILED, "cannot connect '/viewer': no display"),
         ("connect", "die", DIED, DEATH.format("connecting")),
         (
@@ -114,10 +115,11 @@ async def test_a_node_in_which_a_step_fails_has_everything_rolled_back(
     await world.run()
     was_active = step == "activate"
     alive = way not in ("die", "hang")
+    left = ("activate", "connect", "configure").index(step)
     assert world.since("[failure]") == [
         f"[failure] {failure} /viewer",
         f"[stopping] at {4.5 if way == 'hang' else 0.0:.1f} s: rolling back",
-        *(VIEWER_DOWN[not was_active :] if alive else []),
+        *(VIEWER_DOWN[left:] if alive else []),
         *(["/camera deactivate"] if was_active else []),
         *CAMERA_DOWN,
         *over(6),
@@ -291,12 +293,22 @@ async def test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is
 async def test_nodes_that_are_activated_side_by_side_are_not_judged_one_by_one(
     tmp_path: Path,
 ) -> None:
-    world = world_of(tmp_path, *(planned_node(f"n{index}") for index in range(20)))
+    nodes = (planned_node(f"n{index}", process=f"p{index // 2}") for index in range(20))
+    world = world_of(tmp_path, *nodes)
     opened: list[int] = []
     world.story.in_the_moment["[gate]"] = lambda: opened.append(world.graph.looks)
     await world.run()
     assert world.outline[-1] == "[stopped] 0"
     assert world.graph.looks - opened[0] <= 4
+
+
+async def test_networks_that_cannot_be_programmed_keep_the_gate_closed(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    world.hosts.ways["networks programmed"] = "cannot program networks for 'robot': no"
+    await world.run()
+    failed = ["[failure] run.not-programmed robot", "[stopping] at 0.0 s: rolling back"]
+    assert world.since("networks programmed")[1:] == [*failed, *BACK, *over(6)]
+    assert world.messages == ["cannot program networks for 'robot': no"]
 
 
 # Started again before the gate
@@ -408,6 +420,22 @@ async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Pa
         assert viewer.uptime_s == pytest.approx(1.25, abs=0.01)
         assert (viewer.restarts, viewer.last_failure) == (0, None)
         world.hosts.ways.clear()
+
+
+async def test_a_node_that_hangs_is_not_asked_and_is_ended_by_its_watchdog_unless_that_passes(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(PAIR, tmp_path, stop_after_s=20.0)
+    async with world.running("[system] active"):
+        process = world.system.processes["camera"]
+        for hangs_s in (2.0, 10.0):
+            process.on_stop(True)
+            await world.story.until("[verdict] active violated run.silent-node /camera")
+            assert world.graph.asked == ["viewer"]
+            await asyncio.sleep(hangs_s)
+            process.on_stop(False)
+    ends = ("camera SIGKILL", "[backoff] camera in 1.0 s")
+    assert [each for each in world.story if each in ends] == [*ends]
 
 
 async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(

@@ -112,6 +112,28 @@ def test_a_gate_that_stays_closed_activates_nothing_and_takes_the_manifest_back(
     assert not [each for each in play.story if each in ("arm activate", "viewer deactivate")]
 
 
+def test_what_became_active_on_the_way_back_and_is_wrong_is_named_and_stays_active() -> None:
+    play = Play(CHAIN, ways={"arm connect": "no cable"})
+    play.ways["viewer activate"] = "hang"
+    play.order(APPLY, plan=OTHER)
+    play.see(INTRUDER)
+    play.finish("viewer activate")
+    play.wait(40.0)
+    assert "revision 1, but its verdict is violated: wrong: /intruder" in play.answers[0][1]
+    assert (play.levels, play.phase) == ("4 4", "active")
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(refuses: bool) -> None:
+    plan = plan_of(CAMERA, rate(VIEWER, 2.0))
+    set_ = "give viewer {'rate': 2.0}"
+    play = Play(plan_of(CAMERA, rate(VIEWER, 1.0)), ways={set_: "read-only"} if refuses else {})
+    asked = play.order(APPLY, plan=plan)
+    assert asked[0] == set_
+    assert (("viewer deactivate" in asked), ("spawn viewer" in asked)) == (refuses, refuses)
+    assert (play.answers[0][0], play.levels, play.run.plan) == (0, "4 4", plan)
+
+
 def test_parameters_that_were_set_are_set_back() -> None:
     play = Play(plan_of(CAMERA, rate(VIEWER, 1.0)), ways={"arm configure": "no gripper"})
     play.order(APPLY, plan=plan_of(CAMERA, rate(VIEWER, 2.0), ARM))
@@ -131,6 +153,21 @@ def test_parameters_that_a_death_kept_us_from_hearing_of_are_set_back_too() -> N
     assert "cannot keep '/camera' running" in play.answers[0][1]
     assert gives(play) == ["give viewer {'rate': 2.0}", "give viewer {'rate': 1.0}"]
     assert len(play.heard(Restarted)) == 1
+
+
+def test_other_orders_are_refused_meanwhile() -> None:
+    play = Play(CHAIN, ways={"arm configure": "hang"})
+    play.order(APPLY, plan=OTHER)
+    asks = {PAUSE: "pause", RESTART: "restart", APPLY: "apply another manifest to"}
+    for number, ask in enumerate(asks, 1):
+        play.order(ask, id=number)
+        why = (
+            f"cannot {asks[ask]} 'robot': it is applying, another manifest is being applied to "
+            "it; ask again once 'lifecycle apply' has ended; 'lifecycle down' is taken at once"
+        )
+        assert play.answers[number] == (2, why)
+    play.finish("arm configure")
+    assert play.answers[0][0] == 0
 
 
 def test_a_manifest_that_takes_too_long_is_taken_back() -> None:
@@ -470,6 +507,17 @@ def test_what_passes_has_no_consequence() -> None:
         play.see()
         play.wait(0.3)
     assert play.heard(ConsequenceTaken) == []
+
+
+def test_what_concerns_no_node_of_the_system_pauses_all_of_it() -> None:
+    play = Play(replace(CHAIN, on_violation=(Reaction(rule="graph", what=DEACTIVATE),)))
+    play.see(INTRUDER)
+    assert play.wait(0.5) == ["viewer deactivate", "camera deactivate"]
+    why = "on_violation: pause (graph.undeclared-node of /intruder); lifecycle resume"
+    assert (play.phase, {each.withheld for each in play.run.nodes.values()}) == ("paused", {why})
+    play.see()
+    play.order(RESUME)
+    assert (play.levels, len(play.heard(ConsequenceTaken))) == ("4 4", 1)
 
 
 def test_a_node_that_is_started_again_has_no_consequence_for_being_away() -> None:

@@ -232,6 +232,12 @@ def _restart(play: Play) -> None:
     play.order(ControlRequest.RESTART, node="viewer")
 
 
+def _violate(play: Play) -> None:
+    play.see(INTRUDER)
+    play.wait(2.0)
+    play.see()
+
+
 def _hold(play: Play) -> None:
     play.see(INTRUDER)
     play.order(ControlRequest.RESTART, node="viewer")
@@ -246,6 +252,7 @@ def _hold(play: Play) -> None:
         (lambda _: None, 0, ""),
         (_pause, 0, ""),
         (_restart, 143, "; the system was restarting, not active"),
+        (_violate, 0, f"; violated meanwhile, wrong: {STRANGER}"),
         (_hold, 4, f"; held at the gate, and not active; {PASSED}"),
     ],
 )

@@ -25,7 +25,6 @@ from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
     Failure,
-    Restarted,
     SystemReached,
     VerdictChanged,
 )
@@ -45,18 +44,6 @@ def up(node: str) -> list[str]:
 
 
 # Bring-up and take-down
-
-
-def test_a_system_comes_up_along_its_order_and_goes_down_in_reverse() -> None:
-    play = Play(CHAIN)
-    assert play.levels == "4 4"
-    assert play.phase == "active"
-    assert play.down() == [
-        *(*down("viewer"), "signal viewer 0"),
-        *("camera deactivate", "sweep viewer", *down("camera", active=False)),
-        *("signal camera 0", "sweep camera"),
-    ]
-    assert play.code == 0
 
 
 def test_a_plain_node_that_will_not_deactivate_is_started_anew_and_has_no_level_between() -> None:
@@ -156,15 +143,6 @@ def test_a_step_that_hangs_is_late_and_its_time_without_a_processor_is_not_count
     assert play.run.ending.failures[0].rule == "run.deadline"
 
 
-def test_a_second_interrupt_kills_what_is_left() -> None:
-    play = Play(CHAIN, ways={"viewer deactivate": "hang"})
-    play.give(inputs.Stop(reason="interrupted", code=ExitCode.INTERRUPTED, hurries=True))
-    assert not play.run.is_over
-    killed = play.give(inputs.Stop(reason="interrupted", code=ExitCode.INTERRUPTED, hurries=True))
-    assert {"signal camera 9", "signal viewer 9"} <= {*killed}
-    assert play.code == 130
-
-
 def test_a_process_that_dies_while_it_is_taken_down_is_in_the_exit_code() -> None:
     play = Play(CHAIN, ways={"viewer deactivate": "die"})
     play.down()
@@ -221,16 +199,6 @@ def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
 
 
 # Failures
-
-
-def test_a_node_that_crashed_comes_again_through_its_gate_and_what_it_left_is_swept_first() -> None:
-    play = Play(chain())
-    assert play.die("camera") == ["sweep camera"]
-    assert play.levels == "0 4"
-    assert play.wait(1.0) == [*up("camera"), "program", "camera activate"]
-    assert [each.process for each in play.events if isinstance(each, Restarted)] == ["camera"]
-    play.down()
-    assert play.code == 0
 
 
 def test_dependents_go_down_in_order_and_come_again_with_it() -> None:
