@@ -226,20 +226,28 @@ async def test_what_cannot_be_verified_is_taken_on_trust_by_name_or_refused_if_s
         assert world.report.endswith("done; taken on trust: /base (state.unverifiable)")
 
 
+@pytest.mark.parametrize(
+    ("noticed", "before", "why"),
+    [(False, VERIFIED, CHANGED), (True, VERIFIED[:1], "the verdict keeps the gate closed")],
+)
 async def test_what_changes_while_it_is_looked_at_has_the_verdict_judged_again(
-    tmp_path: Path,
+    tmp_path: Path, noticed: bool, before: list[str], why: str
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
 
-    def look() -> None:
-        world.graph.while_looking = world.intrude
+    def comes() -> None:
+        world.intrude()
+        if noticed:
+            world.supervisor.catch_up()
 
-    world.story.in_the_moment["[system] connected"] = look
+    world.story.in_the_moment["[system] connected"] = lambda: setattr(
+        world.graph, "while_looking", comes
+    )
     await world.run()
-    assert world.since("[system] connected")[1:6] == [
-        *VERIFIED,
+    assert world.since("[verdict]")[: len(before) + 2] == [
+        *before,
         f"[verdict] connected violated {INTRUDED}",
-        f"[stopping] at 0.5 s: {CHANGED}",
+        f"[stopping] at 0.5 s: {why}",
     ]
 
 
