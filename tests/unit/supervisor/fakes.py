@@ -202,8 +202,6 @@ class FakeProcess:
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
-            if await self._cannot_host(writer):
-                return
             nodes = [node.full_name for node in spec.nodes]
             self._spawner.begin(nodes)
             if not await self._act(f"{self._name} start", writer, Event(kind="ready"), *nodes):
@@ -225,17 +223,6 @@ class FakeProcess:
                 await self._act(what, writer, reply, command=command)
         if self._name not in self._spawner.ends_at:
             self.end(ProcessExit(status=0))
-
-    async def _cannot_host(self, writer: asyncio.StreamWriter) -> bool:
-        """Report every node that cannot be constructed, and end."""
-        failures = self._spawner.unhosted.get(self._name, {})
-        for node, error in failures.items():
-            writer.write(to_json(Event(kind="failed", node=node, ok=False, error=error)) + b"\n")
-            await writer.drain()
-            await asyncio.sleep(0.1)
-        if failures:
-            self.end(ProcessExit(status=1))
-        return bool(failures)
 
     async def _act(
         self,
@@ -289,7 +276,6 @@ class FakeForkServer:
         log: everything that happened, in order: `talker start`, `/talker configure`, signals.
         ways: what goes wrong: such a line → "hang", "die", or the error to answer with.
         takes_s: how long such a line takes.
-        unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
         starves: by process, for how much of the time its threads wait for a processor, added up.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         cannot_start: why it cannot start processes; empty while it can.
@@ -304,12 +290,10 @@ class FakeForkServer:
         self.log: list[str] = []
         self.ways: dict[str, str] = {}
         self.takes_s: dict[str, float] = {}
-        self.unhosted: dict[str, dict[str, str]] = {}
         self.starves: dict[str, float] = {}
         self.ends_at: dict[str, int] = {}
         self.cannot_start = ""
         self.lingers_s = 0.0
-        self.strays: tuple[int, ...] = ()
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
         self.nodes: dict[str, tuple[str, ...]] = {}
@@ -390,49 +374,63 @@ class FakeForkServer:
         return ()
 
     async def end_strays(self) -> tuple[int, ...]:
-        return self.strays
+        return ()
 
     async def close(self) -> None:
         """Nothing to close."""
 
 
-def verdict_of(outcome: Outcome, *rules: str, blocking: bool | None = None) -> Verdict:
-    """A verdict with one finding for each rule."""
-    return Verdict(
-        verdict=outcome,
-        blocking=outcome is Outcome.VIOLATED if blocking is None else blocking,
-        findings=tuple(
+def verdict(*found: tuple[str, ...], outcome: Outcome | None = None) -> Verdict:
+    """A verdict of findings, violated by default and ok by none.
+
+    Args:
+        found: of each the rule, the subject (`/a`, or `/topic: /a → /b` for two ends), and the
+            node, where that is not the subject.
+        outcome: of all of them.
+    """
+    outcome = outcome or (Outcome.VIOLATED if found else Outcome.OK)
+    findings = []
+    for rule, subject, *node in found:
+        ends = tuple(subject.rpartition(": ")[2].split(" → ")) if "→" in subject else ()
+        findings.append(
             Finding(
                 rule=rule,
                 outcome=outcome,
-                subject="/camera",
+                subject=subject,
                 expected="",
                 observed="",
-                message=f"{rule} on /camera",
+                message=f"{rule} {subject}",
+                node="" if ends else (node or [subject])[0],
+                ends=ends,
             )
-            for rule in rules
-        ),
-        flows=(),
-    )
+        )
+    violated = outcome is Outcome.VIOLATED
+    return Verdict(verdict=outcome, blocking=violated, findings=tuple(findings), flows=())
+
+
+def verdict_of(outcome: Outcome, *rules: str) -> Verdict:
+    """A verdict with one finding of `/camera` for each rule."""
+    return verdict(*((rule, "/camera") for rule in rules), outcome=outcome)
 
 
 class World:
-    """A system of fakes with everything recorded."""
+    """A system of fakes with everything recorded.
+
+    Attributes:
+        hosts: start, and obey or not, as they are told.
+        events: so far.
+        system: what this supervisor runs of a plan.
+    """
 
     def __init__(
         self, plan: Plan, directory: Path, processes: Iterable[PlannedProcess] | None = None
     ) -> None:
-        self.spawner = FakeForkServer()
+        self.hosts = FakeForkServer()
         self.events: list[SupervisorEvent] = []
-        self.emit = Emitter()
+        self.emit = Emitter(asyncio.get_running_loop().time)
         self.emit.listen(self.events.append)
         own = plan.processes if processes is None else processes
         self.system = System(plan, emit=self.emit, logs=directory, processes=own)
-
-    @property
-    def log(self) -> list[str]:
-        """What the hosts were asked, in order."""
-        return self.spawner.log
 
     def heard(self, kind: type[T]) -> list[T]:
         """Events of one kind."""

@@ -20,15 +20,17 @@ from collections.abc import (
     Mapping,
 )
 from pathlib import Path
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any
 
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
+from lifecycle.middleware.discovery.liveliness import Notice
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.run_directory import RunDirectory, short_path
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import (
@@ -38,17 +40,12 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
 )
 from lifecycle.supervisor.control.ros_interface import Entry
-from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
-    ConsequenceTaken,
-    Emitter,
     Event,
     Failure,
     GateOpened,
-    GaveUp,
     ManifestApplied,
-    ModeEntered,
     NodeChanged,
     NodeJoined,
     NodeLeft,
@@ -70,30 +67,67 @@ from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeForkServer, interface_of
-
-E = TypeVar("E", bound=Event)
+from tests.unit.supervisor.fakes import FakeForkServer, World, interface_of
 
 SHUTDOWN_S = 30.0
 """However a node or a process resists, a system of the size of these is down within so long."""
 
 
-class _Connection:
-    """Carries nothing: no other supervisor is in this world."""
+class FakeAir:
+    """Carries nothing to other supervisors, and remembers what was announced and watched."""
 
-    def destroy(self) -> None:
-        """Nothing to destroy."""
+    def __init__(self) -> None:
+        self.watched: dict[str, SimpleNamespace] = {}
+        self.announced: dict[str, list[Mapping[str, str]]] = {}
+        self.received: list[dict[str, tuple[int, int]]] = []
+        self.plans: list[str] = []
+        self.arrives: Callable[[str], None] | None = None
+        self.done: list[str] = []
+
+    def announce_alive(self, topic: str) -> SimpleNamespace:
+        said = self.announced.setdefault(topic, [])
+
+        def notify(notice: Notice) -> None:
+            said.append(dict(notice.silent))
+            self.received.append(dict(notice.received))
+
+        return SimpleNamespace(notify=notify, destroy=lambda: None)
+
+    def watch_alive(self, topic: str, **callbacks: Callable[..., None]) -> SimpleNamespace:
+        on_notice = callbacks["on_notice"]
+        self.watched[topic] = SimpleNamespace(
+            alive=callbacks["on_liveliness"],
+            left=callbacks["on_left"],
+            silent=lambda silent: on_notice(Notice(silent=silent), 0, 0),
+            times=lambda sent_ns, received_ns, theirs: on_notice(
+                Notice(silent={}, received=theirs), sent_ns, received_ns
+            ),
+            destroy=lambda: self.watched.pop(topic),
+        )
+        return self.watched[topic]
+
+    def plan_notices(self, on_notice: Callable[[str], None]) -> FakeAir:
+        self.arrives = on_notice
+        return self
 
     def announce(self, text: str) -> None:
-        """Nobody reads it."""
+        self.plans.append(text)
+
+    def destroy(self) -> None:
+        self.arrives = None
+
+    def send_again_soon(self) -> None:
+        self.done.append("send_again_soon")
+
+    def republish_names(self) -> None:
+        self.done.append("republish_names")
 
 
 class FakeRosInterface:
     """What ROS programs see of a supervisor.
 
     Attributes:
-        statuses: published so far.
-        diagnostics: published so far; each a list of entries.
+        statuses: published so far; `diagnostics`: likewise, each a list of entries.
     """
 
     def __init__(
@@ -102,12 +136,10 @@ class FakeRosInterface:
         services: tuple[str, ...],
         on_call: Callable[[str, Callable[[bool, str], None]], None],
     ) -> None:
-        self.prefix = prefix
-        self.services = services
+        self.prefix, self.services = prefix, services
         self.statuses: list[str] = []
         self.diagnostics: list[tuple[Entry, ...]] = []
         self.destroyed = False
-        self.diagnoses = True
         self._on_call = on_call
 
     async def call(self, name: str) -> tuple[bool, str]:
@@ -128,7 +160,7 @@ class FakeRosInterface:
         self.destroyed = True
 
 
-class FakeParticipant:
+class FakeParticipant(FakeAir):
     """Sees the nodes of the fake hosts, and those that others run; reaches the latter.
 
     Attributes:
@@ -138,29 +170,27 @@ class FakeParticipant:
         pids: of the processes that `others` run in, where they are known.
         twice: names that several nodes carry.
         services: of the nodes in `others`.
-        changes: so far.
-        dropped: nodes whose reports were forgotten.
+        changes: so far; `looks`: how often it was looked.
+        dropped: nodes whose reports were forgotten; `forgotten`: processes that were.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         no_ros: why it cannot be made; empty if it can.
-        refuses: value of a parameter that no node takes, `rate=5`.
-        refuses_live: why nodes do not take parameters while they run.
     """
 
     def __init__(self, hosts: FakeForkServer) -> None:
+        super().__init__()
         self.others: dict[str, str] = {}
         self.pids: dict[str, int] = {}
         self.twice: set[str] = set()
         self.unseen: set[str] = set()
         self.mute: set[str] = set()
         self.services = FakeServices(self, hosts)
-        self.changes = 0
+        self.changes = self.looks = 0
         self.dropped: list[str] = []
+        self.forgotten: list[int] = []
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
         self.no_ros = ""
-        self.refuses = ""
-        self.refuses_live: dict[str, str] = {}
         self.graph = self.discovery = self.settling = self.state = self
         self.clients = self.services
         self._hosts = hosts
@@ -191,7 +221,9 @@ class FakeParticipant:
         only: Collection[str] | None = None,
         machines: Collection[str] | None = None,
     ) -> Observation:
-        del plan, only, machines
+        del only, machines
+        self.looks += 1
+        self.asked = [each.key for each in plan.nodes]
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(
@@ -228,15 +260,7 @@ class FakeParticipant:
         self._reports.pop(node, None)
 
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
-        """Nothing is left in this graph."""
-
-    def watch_alive(self, topic: str, **callbacks: object) -> _Connection:
-        del topic, callbacks
-        return _Connection()
-
-    def plan_notices(self, on_notice: Callable[[str], None]) -> _Connection:
-        del on_notice
-        return _Connection()
+        self.forgotten.append(pid)
 
     def ros_interface(
         self,
@@ -249,15 +273,9 @@ class FakeParticipant:
         assert self.ros is None
         if self.no_ros:
             raise MiddlewareError(self.no_ros)
+        del diagnoses
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
-        self.ros.diagnoses = diagnoses
         return self.ros
-
-    def send_again_soon(self) -> None:
-        """No link is ever lost."""
-
-    def republish_names(self) -> None:
-        """No name is ever forgotten."""
 
     def prepare_to_leave(self) -> None:
         """Everybody answers."""
@@ -273,14 +291,17 @@ _REACHED = {
 
 
 class FakeServices:
-    """The lifecycle services of the nodes that others run.
+    """The lifecycle services of the nodes that others run, and the parameters of all.
+
+    What is asked is in the log of the hosts, `/base activate`, `/base set {'rate': 1.0}`, and takes
+    as long, and fails, as is said of such a line there: for a transition before it leaves.
 
     Attributes:
-        matched_after_s: of a request, as `/base activate`: seconds before it can leave.
+        moved_to: states that somebody moves a node to right after each of the first requests.
     """
 
     def __init__(self, graph: FakeParticipant, hosts: FakeForkServer) -> None:
-        self.matched_after_s: dict[str, float] = {}
+        self.moved_to: list[str] = []
         self._graph = graph
         self._hosts = hosts
 
@@ -292,28 +313,16 @@ class FakeServices:
     def serves_parameters(self, node: str) -> bool | None:
         return True
 
-    async def give_parameters(self, node: PlannedNode) -> None:
-        """Note what is set; a node may refuse."""
-        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
-        self._hosts.log.append(f"{node.full_name} given {given}")
-        if self._graph.refuses in given.split():
-            raise MiddlewareError(f"cannot set {self._graph.refuses!r}")
-
     async def set_parameters(
         self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
     ) -> None:
         assert values.keys() == types.keys()
         self._hosts.log.append(f"{node} set {values}")
-        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
-        if node in self._graph.refuses_live:
-            raise MiddlewareError(self._graph.refuses_live[node])
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
-        del timeout_s
         return self._graph.others[node]
 
     async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
-        del node, timeout_s
         return tuple(_REACHED)
 
     async def change_state(
@@ -324,49 +333,41 @@ class FakeServices:
         timeout_s: float,
         before: Callable[[], Awaitable[None]] | None = None,
     ) -> bool:
-        del timeout_s
-        await asyncio.sleep(self.matched_after_s.get(f"{node} {transition}", 0.0))
+        await asyncio.sleep(self._hosts.takes_s.get(f"{node} {transition}", 0.0))
         if before is not None:
             await before()
         self._hosts.log.append(f"{node} {transition}")
-        self._graph.others[node] = _REACHED[transition]
+        moved = self.moved_to.pop(0) if self.moved_to else _REACHED[transition]
+        self._graph.others[node] = moved
         self._graph.note()
         return True
 
     async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
-        del node, timeout_s
         return None
-
-    async def wire(self, node: str, *asked: object, timeout_s: float) -> None:
-        raise AssertionError(f"no authority wires {node}: {asked} {timeout_s}")
 
 
 class FakeNetworks(Networks):
-    """Networks that take their time, and may fail.
+    """Networks that take as long as hosts do for `networks programmed`, and fail as is said there.
 
-    Attributes:
-        takes_s: seconds to program them.
-        fails: why they cannot be programmed; empty while they can.
+    Args:
+        hosts: have the log.
     """
 
-    def __init__(self, log: list[str]) -> None:
-        self.takes_s = 0.0
-        self.fails = ""
-        self._log = log
+    def __init__(self, hosts: FakeForkServer) -> None:
+        self._hosts = hosts
 
     def replan(self, plan: Plan) -> None:
         """What it programs is of no account."""
 
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
-        del timeout_s
-        self._log.append(f"networks programmed ({verdict.verdict.value})")
-        await asyncio.sleep(self.takes_s)
-        if self.fails:
-            raise BringUpError(self.fails)
+        what = "networks programmed"
+        self._hosts.log.append(f"{what} ({verdict.verdict.value})")
+        await asyncio.sleep(self._hosts.takes_s.get(what, 0.0))
+        if what in self._hosts.ways:
+            raise BringUpError(self._hosts.ways[what])
 
     async def close(self, hurry: asyncio.Event) -> None:
-        del hurry
-        self._log.append("networks restored")
+        self._hosts.log.append("networks restored")
 
 
 class _Story(list[str]):
@@ -401,12 +402,7 @@ _DETAIL = ("[process]", "[node]", "[request]", "[joined]", "[left]", "[log]")
 
 
 def _applied(event: ManifestApplied) -> str:
-    what = {
-        "added": event.added,
-        "removed": event.removed,
-        "restarted": event.restarted,
-        "parameters of": event.parameters,
-    }
+    what = {"added": event.added, "parameters of": event.parameters}
     said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
     return f"{event.stage} revision {event.revision}{said}"
 
@@ -430,10 +426,7 @@ _SAID: dict[type, Callable[[Any], str]] = {
     NodeLeft: lambda of: of.node,
     RestartScheduled: lambda of: f"{of.process} in {of.in_s:.1f} s",
     Restarted: lambda of: f"{of.process} ({of.restarts})",
-    GaveUp: lambda of: f"{of.process} ({len(of.history)} failures)",
-    ModeEntered: lambda of: f"{of.mode} without {' '.join(of.inactive)}".removesuffix(" without "),
     ManifestApplied: _applied,
-    ConsequenceTaken: lambda of: f"{of.action} {' '.join(of.nodes)} for {of.rule}",
 }
 
 
@@ -444,7 +437,7 @@ def _line(event: Event, now_s: float) -> str:
     return f"[{event.kind}] {said}".removesuffix(" ()").rstrip()
 
 
-class SessionWorld:
+class SessionWorld(World):
     """One session with all that it acts on; make it, prepare it, `run` it once.
 
     Attributes:
@@ -452,38 +445,28 @@ class SessionWorld:
             all events in brackets, in the order in which they happened.
         hosts: start, and obey or not, as they are told.
         graph: what discovery shows beside the nodes of the hosts.
-        networks: to be programmed.
         result: of the run; None before its end.
         status: gives what `lifecycle status` shows; during the run.
         supervisor: likewise.
         prepare: called once that is made, before it runs.
-        events: so far.
     """
 
     def __init__(self, plan: Plan, tmp_path: Path, **options: Any) -> None:
-        loop = asyncio.get_running_loop()
-        self.story = _Story()
-        self.hosts = FakeForkServer()
-        self.hosts.log = self.story
+        (tmp_path / "logs").mkdir()
+        super().__init__(plan, tmp_path / "logs")
+        self.story = self.hosts.log = _Story()
         self.graph = FakeParticipant(self.hosts)
-        self.networks = FakeNetworks(self.story)
         self.ending = Ending()
         self.result: UpResult | None = None
         self.status: Callable[[], SystemStatus]
         self.supervisor: Supervisor
         self.prepare: Callable[[], None] = lambda: None
-        self.events: list[Event] = []
         self._stopping_at_s: float | None = None
         self._tmp_path = tmp_path
-        self._emit = Emitter(loop.time)
-        self._emit.listen(self._take)
+        self.emit.listen(self._take)
         self.journal = Journal("robot", "0", say=self.story.append)
-        self._emit.listen(self.journal.on_event)
+        self.emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
-        (tmp_path / "logs").mkdir()
-        self.system = System(
-            plan, emit=self._emit, logs=tmp_path / "logs", processes=plan.processes
-        )
         for node in plan.nodes:
             if node.run.kind is RunKind.ATTACH:
                 self.graph.others[node.full_name] = "unconfigured"
@@ -524,7 +507,7 @@ class SessionWorld:
                 records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
-                networks=self.networks,
+                networks=FakeNetworks(self.hosts),
                 ending=self.ending,
             )
             session = self.supervisor = Supervisor(self.system, self._options, means)
@@ -597,9 +580,9 @@ class SessionWorld:
         self.graph.others["/intruder"] = ""
         self.graph.note()
 
-    def double(self, *nodes: str) -> None:
-        """Let nodes be there two times, which violates what is declared of them; none: once."""
-        self.graph.twice = set(nodes)
+    def hide(self, *nodes: str) -> None:
+        """Hide nodes from the graph, as behind a link that is cut; none: show all again."""
+        self.graph.unseen = set(nodes)
         self.graph.note()
 
     def retreat(self) -> None:
@@ -611,15 +594,10 @@ class SessionWorld:
         """Let a process end as by a crash."""
         self.hosts.processes[process].end(ProcessExit(signal=signal.SIGSEGV))
 
-    def heard(self, kind: type[E]) -> list[E]:
-        """Events of one kind."""
-        return [each for each in self.events if isinstance(each, kind)]
-
     def _take(self, event: Event) -> None:
-        self.events.append(event)
         if isinstance(event, Stopping):
-            self._stopping_at_s = self._emit.elapsed_s
-        self.story.append(_line(event, self._emit.elapsed_s))
+            self._stopping_at_s = self.emit.elapsed_s
+        self.story.append(_line(event, self.emit.elapsed_s))
 
     def _check(self) -> None:
         """What holds in every run."""
@@ -631,7 +609,7 @@ class SessionWorld:
         assert self.story.count("networks restored") == 1
         assert all(each.exited.done() for each in self.hosts.processes.values())
         assert self._stopping_at_s is not None
-        assert self._emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
+        assert self.emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()
         self._check_journal()
 
@@ -661,16 +639,14 @@ class SessionWorld:
                 assert verdict in ("ok", "unverifiable"), f"{kind} was activated on {verdict}"
 
 
-def connected_by(*urls: str) -> ParticipantConnections:
-    """How a node's own participant is connected."""
-    return ParticipantConnections(urls=urls)
-
-
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
 
+_URLS = ("tcpv4://127.0.0.1:7911", "tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")
 DIALLING = plan_of(
-    replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
-    replace(CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")),
+    *(
+        replace(node, connections=ParticipantConnections(urls=(url,)))
+        for node, url in zip(CHAIN.nodes, _URLS, strict=True)
+    )
 )
 """The same by TCP alone: `viewer` gets another port when it is started again."""
 
@@ -707,10 +683,6 @@ ATTACHED = plan_of(
 CHANGED = "the system changed before every node was activated"
 
 REFUSED = """cannot activate: the verdict is violated
-  graph.undeclared-node: the manifest does not declare node /intruder"""
-
-REFUSED_AGAIN = """cannot activate: the system changed before every node was activated, and its \
-verdict now is violated
   graph.undeclared-node: the manifest does not declare node /intruder"""
 
 INTRUDED = "graph.undeclared-node /intruder"

@@ -18,7 +18,6 @@ from msgspec.structs import replace
 
 from lifecycle.cli.verbs import history
 from lifecycle.errors import UsageError
-from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.run.events import Notice, RunStarted, Stopped, VerdictChanged
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.verify.outcome import Outcome
@@ -63,9 +62,7 @@ def test_every_line_is_as_the_schema_says(kept: Kept) -> None:
         jsonschema.validate(each, schema)
 
 
-def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(
-    kept: Kept,
-) -> None:
+def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(kept: Kept) -> None:
     kept.journal._file.largest = 2_000
     for number in range(40):
         kept.say(f"{number}")
@@ -74,26 +71,6 @@ def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(
     assert all(read_run([each]).run is not None for each in (older, newest))
     said = [each.event.message for each in read_run((older, newest)).moments if each.event]
     assert said == [f"{number}" for number in range(40 - len(said), 40)]
-
-
-def test_what_cannot_be_written_is_said_once(
-    kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logs, "TRIED_AGAIN_S", 0.0)
-    full = tmp_path / "journal.jsonl"
-    kept.say("kept")
-    kept.journal._file.close()
-    full.rename(tmp_path / "journal.jsonl.1")
-    full.symlink_to("/dev/full")
-    for _ in range(3):
-        kept.say("lost")
-    full.unlink()
-    kept.journal._file.close()
-    kept.say("kept again")
-    assert len(kept.said) == 1
-    assert "No space left on device; the run goes on" in kept.said[0]
-    recorded = read_run(journal_files(tmp_path))
-    assert [each.event.message for each in recorded.moments if each.event] == ["kept", "kept again"]
 
 
 def test_a_torn_line_and_a_foreign_one_are_passed_over_and_named(kept: Kept) -> None:
@@ -147,7 +124,7 @@ def test_below_a_verdict_are_the_findings_that_came_and_went(kept: Kept) -> None
         kept.journal.on_event(each)
     text = _verb(history.command, str(kept.directory))[1]
     assert [line for line in text.splitlines() if line.startswith("    ")] == [
-        "    + violated graph.missing-node: graph.missing-node on /camera",
+        "    + violated graph.missing-node: graph.missing-node /camera",
         "    - violated graph.missing-node: /camera",
     ]
 

@@ -72,17 +72,37 @@ async def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(
     assert world.graph.others == FOUND
 
 
-async def test_on_a_violated_verdict_nothing_is_activated_and_all_is_left_as_it_was_found(
-    tmp_path: Path,
+LIDAR = planned_node("lidar")
+
+
+@pytest.mark.parametrize(
+    ("plan", "until", "intrudes", "verdict", "code"),
+    [
+        (ROBOT, Until.ACTIVE, True, f"violated {INTRUDED}", 4),
+        (ROBOT, Until.CONNECTED, False, "ok", 0),
+        (
+            plan_of(replace(LIDAR, state=TargetState.INACTIVE)),
+            Until.ACTIVE,
+            False,
+            "violated state.wrong-state /lidar",
+            4,
+        ),
+    ],
+)
+async def test_where_nothing_may_be_activated_it_is_judged_and_left_as_it_was_found(
+    tmp_path: Path, plan: Plan, until: Until, intrudes: bool, verdict: str, code: int
 ) -> None:
-    world = world_of(tmp_path)
-    world.intrude()
+    world = world_of(tmp_path, plan, until=until)
+    if intrudes:
+        world.intrude()
+    found = dict(world.graph.others)
     await world.run()
-    assert world.result is not None
-    assert world.result.exit_code == ExitCode.VIOLATED
-    assert f"[verdict] connected violated {INTRUDED}" in world.outline
+    verdicts = [each for each in world.outline if each.startswith("[verdict]")]
+    assert verdicts == [f"[verdict] connected {verdict}"]
+    assert world.outline[-1] == f"[stopped] {code}"
     assert not [each for each in world.outline if each.endswith(" activate")]
-    assert world.graph.others == {**FOUND, "/intruder": ""}
+    assert requests(world, "/lidar") == []
+    assert world.graph.others == found
 
 
 async def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_asked(
@@ -122,25 +142,13 @@ async def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_
 
 
 async def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
-    world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
+    world = world_of(tmp_path, plan_of(LIDAR), stop_after_s=0.0)
     world.graph.others["/lidar"] = "activating"
     async with world.running():
         await asyncio.sleep(1.0)
         world.graph.others["/lidar"] = "active"
     assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
     assert world.outline[-1] == "[stopped] 0"
-
-
-async def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(
-    tmp_path: Path,
-) -> None:
-    lidar = replace(planned_node("lidar"), state=TargetState.INACTIVE)
-    world = world_of(tmp_path, plan_of(lidar))
-    await world.run()
-    assert "[verdict] connected violated state.wrong-state /lidar" in world.outline
-    assert world.outline[-1] == "[stopped] 4"
-    assert world.graph.others == {"/lidar": "active"}
-    assert requests(world, "/lidar") == []
 
 
 @pytest.mark.parametrize("adopt", [False, True])
@@ -163,7 +171,7 @@ async def test_an_attached_node_that_is_active_is_refused_but_for_adopt(
 async def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
     tmp_path: Path,
 ) -> None:
-    world = world_of(tmp_path, plan_of(planned_node("lidar")))
+    world = world_of(tmp_path, plan_of(LIDAR))
     async with world.running("[system] active"):
         for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
             assert await world.order(ask) == "0"
@@ -174,17 +182,6 @@ async def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_
     assert requests(world, "/lidar") == ["deactivate", "activate"]
     assert world.graph.others == {"/lidar": "active"}
     assert world.outline[-1] == "[stopped] 0"
-
-
-async def test_what_is_adopted_is_judged_also_where_nothing_is_to_be_activated(
-    tmp_path: Path,
-) -> None:
-    world = world_of(tmp_path, until=Until.CONNECTED)
-    await world.run()
-    assert [each for each in world.outline if each.startswith("[verdict]")] == [
-        "[verdict] connected ok"
-    ]
-    assert world.graph.others == FOUND
 
 
 async def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,8 @@ from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, Service
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World
+from tests.unit.supervisor.fakes import FakeForkServer, World
+from tests.unit.supervisor.session_world import FakeParticipant
 
 
 class _Node:
@@ -97,80 +97,55 @@ async def test_a_node_that_serves_nothing_is_named_and_not_found(
     assert notices == ["'/base' serves no parameters: whether it hangs is not seen"]
 
 
-class ForeignNode:
-    """The lifecycle services of a managed node that others started, and may move meanwhile.
-
-    Attributes:
-        moved_to: states that somebody moves it to right after each of the first requests.
-        requests: so far.
-    """
+class Foreign(FakeParticipant):
+    """Node `/b`, which others started, and what it was asked."""
 
     def __init__(self, state: str, *moved_to: str) -> None:
-        self.state = state
-        self.moved_to = list(moved_to)
-        self.requests: list[str] = []
+        self.hosts = FakeForkServer()
+        super().__init__(self.hosts)
+        self.others["/b"] = state
+        self.services.moved_to = [*moved_to]
 
-    async def get_state(self, node: str, *, timeout_s: float) -> str:
-        return self.state
+    async def perform(self, operation: Operation, *, holds: bool | None = None) -> str:
+        """Have it driven; return its state. `holds`: the permit, if there is one, does."""
 
-    async def change_state(
-        self,
-        node: str,
-        transition: str,
-        *,
-        timeout_s: float,
-        before: Callable[[], Awaitable[None]] | None = None,
-    ) -> bool:
-        if before is not None:
-            await before()
-        self.requests.append(transition)
-        self.state = "inactive" if transition == "deactivate" else "active"
-        if self.moved_to:
-            self.state = self.moved_to.pop(0)
-        return True
+        async def permit() -> None:
+            if not holds:
+                raise ChangedError("the gate closed again")
 
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> str:
-        """Have it driven; return its state."""
-        driver = ServiceDriver(self, planned_node("b"))  # type: ignore[arg-type]
-        return (await driver.perform(operation, permit)).state  # type: ignore[arg-type]
-
-
-class Permit:
-    """Lets a request leave, or keeps it back."""
-
-    def __init__(self, *, holds: bool = True) -> None:
-        self._holds = holds
-
-    async def __call__(self) -> None:
-        if not self._holds:
-            raise ChangedError("the gate closed again")
+        driver = ServiceDriver(self.services, planned_node("b"))  # type: ignore[arg-type]
+        given = None if holds is None else permit
+        return (await driver.perform(operation, given)).state
 
 
 async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
-    node = ForeignNode("inactive")
+    node = Foreign("inactive")
     with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
         await node.perform(Operation.ACTIVATE)
     with pytest.raises(ChangedError):
-        await node.perform(Operation.ACTIVATE, Permit(holds=False))
-    assert node.requests == []
-    await node.perform(Operation.ACTIVATE, Permit())
-    assert node.requests == ["activate"]
+        await node.perform(Operation.ACTIVATE, holds=False)
+    assert node.hosts.log == []
+    await node.perform(Operation.ACTIVATE, holds=True)
+    assert node.hosts.log == ["/b activate"]
 
 
-async def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
-    node = ForeignNode("active", "active")
-    assert await node.perform(Operation.DEACTIVATE) == "inactive"
-    assert node.requests == ["deactivate", "deactivate"]
-    node = ForeignNode("inactive", "inactive")
-    assert await node.perform(Operation.ACTIVATE, Permit()) == "active"
-    assert node.requests == ["activate", "activate"]
+@pytest.mark.parametrize(
+    ("state", "operation", "reached"),
+    [("active", Operation.DEACTIVATE, "inactive"), ("inactive", Operation.ACTIVATE, "active")],
+)
+async def test_a_node_that_somebody_moves_back_meanwhile_is_asked_again(
+    state: str, operation: Operation, reached: str
+) -> None:
+    node = Foreign(state, state)
+    assert await node.perform(operation, holds=True) == reached
+    assert node.hosts.log == [f"/b {operation.value}"] * 2
 
 
 async def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
-    node = ForeignNode("active", *["active"] * 9)
+    node = Foreign("active", *["active"] * 9)
     with pytest.raises(ActiveError, match="activated again by its own code or another client"):
         await node.perform(Operation.DEACTIVATE)
-    node = ForeignNode("active", "unconfigured")
+    node = Foreign("active", "unconfigured")
     with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
         await node.perform(Operation.DEACTIVATE)
-    assert node.requests == ["deactivate"]
+    assert node.hosts.log == ["/b deactivate"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,12 +14,12 @@ from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
+from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import Event
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeForkServer, FakeProcess, World
+from tests.unit.supervisor.fakes import FakeForkServer, World
 
 REAL_TIME = True
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
@@ -47,16 +47,7 @@ def served(port: int, machine: str = "") -> Plan:
 
 def world(plan: Plan, directory: Path) -> tuple[System, FakeForkServer]:
     made = World(plan, directory)
-    return made.system, made.spawner
-
-
-class _EndsAtOnce(FakeForkServer):
-    async def spawn(
-        self, process: ManagedProcess, streams: Sequence[int], control: int | None
-    ) -> FakeProcess:
-        child = await super().spawn(process, streams, control)
-        child.end(ProcessExit(status=1))
-        return child
+    return made.system, made.hosts
 
 
 async def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_run(
@@ -76,9 +67,10 @@ async def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_ru
 
 
 async def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> None:
-    system, _ = world(served(nobody), tmp_path)
+    system, spawner = world(served(nobody), tmp_path)
+    spawner.changed = lambda: spawner.processes["discovery_server"].end(ProcessExit(status=1))
     with pytest.raises(StepFailedError) as caught:
-        await discovery_server.begin(system, _EndsAtOnce(), ours=True)
+        await discovery_server.begin(system, spawner, ours=True)
     said: list[Event] = []
     system.emit.listen(said.append)
     for _ in range(2):

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from lifecycle.supervisor.shell.looks import undiscovered
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.verdict import Finding, Verdict
+from tests.unit.supervisor.fakes import verdict
 
 OURS = frozenset(("/talker", "/listener", "/neighbour"))
 MISSING = ("graph.missing-node", "/listener")
@@ -17,27 +17,6 @@ TO_NEIGHBOUR = ("graph.unmatched-flow", "/chatter: /talker → /neighbour")
 AWAITED = ("graph.missing-node", "/elsewhere")
 TO_AWAITED = ("graph.unmatched-flow", "/chatter: /talker → /elsewhere")
 WRONG = ("graph.qos-incompatible", "/chatter: /talker → /listener")
-
-
-def verdict(*found: tuple[str, str], outcome: Outcome = Outcome.VIOLATED) -> Verdict:
-    return Verdict(
-        verdict=outcome,
-        blocking=True,
-        findings=tuple(
-            Finding(
-                rule=rule,
-                outcome=outcome,
-                subject=subject,
-                expected="",
-                observed="",
-                message="",
-                node="" if "→" in subject else subject,
-                ends=tuple(subject.rpartition(": ")[2].split(" → ")) if "→" in subject else (),
-            )
-            for rule, subject in found
-        ),
-        flows=(),
-    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.plan.model import Plan
@@ -32,6 +33,7 @@ from lifecycle.verify.verdict import FlowReport, Stage, Verdict
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import nef_settings, settings_file
 from tests.unit.programming.servers import TOKEN, NefServer
+from tests.unit.supervisor.fakes import verdict_of
 
 _BOUND_S = 5.0
 REAL_TIME = True
@@ -86,44 +88,44 @@ class FakePrograms:
 
 def verdict(*topics: str) -> Verdict:
     flows = tuple(report(each) for each in topics)
-    return Verdict(verdict=Outcome.OK, blocking=False, findings=(), flows=flows)
+    return replace(verdict_of(Outcome.OK), flows=flows)
 
 
 def heard(*topics: str) -> VerdictChanged:
     return VerdictChanged(stage=Stage.ACTIVE, verdict=verdict(*topics))
 
 
-class Told:
+class Notices:
     """An emitter, and the notices that went through it."""
 
     def __init__(self) -> None:
         self.emit = Emitter()
-        self.notices: list[str] = []
-        self.emit.listen(self._hear)
+        self.said: list[str] = []
+        self.emit.listen(self._take)
 
-    def _hear(self, event: object) -> None:
+    def _take(self, event: object) -> None:
         if isinstance(event, Notice):
-            self.notices.append(event.message)
+            self.said.append(event.message)
 
 
 async def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the_end(
     tmp_path: Path,
 ) -> None:
-    told, programs = Told(), FakePrograms()
-    networks = Networks("s", tmp_path, told.emit, programs)
-    told.emit(heard("/before"))
+    notices, programs = Notices(), FakePrograms()
+    networks = Networks("s", tmp_path, notices.emit, programs)
+    notices.emit(heard("/before"))
     await networks.begin(verdict("/gate"))
     assert programs.seen == [("/gate",)]
     networks.replan(plan())
     assert programs.plans == [plan()]
     programs.asked.clear()
-    told.emit(heard("/later"))
+    notices.emit(heard("/later"))
     await programs.asked.wait()
     await networks.close(asyncio.Event())
-    told.emit(heard("/after"))
+    notices.emit(heard("/after"))
     await asyncio.sleep(0)
     assert programs.seen == [("/gate",), ("/later",), ("closed",)]
-    assert told.notices[0] == "fake: 1 created, 0 unchanged\n  + k: w"
+    assert notices.said[0] == "fake: 1 created, 0 unchanged\n  + k: w"
 
 
 async def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) -> None:
@@ -133,9 +135,8 @@ async def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Pa
     with pytest.raises(BringUpError) as caught:
         await networks.begin(verdict("/gate"))
     await networks.close(asyncio.Event())
-    error = caught.value
-    assert error.exit_code is ExitCode.BRING_UP_FAILED
-    assert str(error) == (
+    assert caught.value.exit_code is ExitCode.BRING_UP_FAILED
+    assert str(caught.value) == (
         "cannot program networks for 's': cannot write nft table inet flowqos_s: 'nft -f -' needs "
         "CAP_NET_ADMIN in this network namespace; run this command as root"
     )
@@ -146,27 +147,27 @@ async def test_a_later_failure_is_a_notice_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lifecycle.supervisor.connections.networks._AGAIN_S", (0.001, 0.01))
-    told, programs = Told(), FakePrograms()
-    networks = Networks("s", tmp_path, told.emit, programs)
+    notices, programs = Notices(), FakePrograms()
+    networks = Networks("s", tmp_path, notices.emit, programs)
     await networks.begin(verdict("/gate"))
     programs.fail = 1
-    told.emit(heard("/later"))
+    notices.emit(heard("/later"))
     programs.asked.clear()  # before each look: what is asked after it wakes us
     while programs.seen[-1:] != [("/later",)]:
         await programs.asked.wait()
         programs.asked.clear()
     await networks.close(asyncio.Event())
-    said = [each.partition(":")[0] for each in told.notices]
+    said = [each.partition(":")[0] for each in notices.said]
     assert said[:2] == ["fake", "cannot write nft table inet flowqos_s"]
 
 
 async def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
-    told = Told()
-    networks = Networks("s", tmp_path, told.emit)
+    notices = Notices()
+    networks = Networks("s", tmp_path, notices.emit)
     await networks.begin(verdict("/gate"))
-    told.emit(heard("/later"))
+    notices.emit(heard("/later"))
     await networks.close(asyncio.Event())
-    assert told.notices == []
+    assert notices.said == []
     assert list(tmp_path.iterdir()) == []  # noqa: ASYNC240
 
 
@@ -201,18 +202,18 @@ def applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Applied
 def test_what_somebody_applied_by_hand_goes_with_the_system_or_stays_listed(
     applied: Applied, may: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = Told()
+    notices = Notices()
     directory = applied.apply()
     assert len(applied.server.subscriptions) == 1
     if not may:
         monkeypatch.delenv("TEST_TOKEN")
 
     async def close() -> None:
-        await Networks("s", directory, told.emit).close(asyncio.Event())
+        await Networks("s", directory, notices.emit).close(asyncio.Event())
 
     asyncio.run(close())
     said = "1 deleted, 0 unchanged" if may else "TEST_TOKEN: it is empty or not set"
-    assert said in told.notices[0]
+    assert said in notices.said[0]
     assert len(applied.server.subscriptions) == (not may)
     assert (directory / "programmed.json").exists() is not may
 
@@ -227,18 +228,18 @@ def test_down_of_a_dead_supervisors_run_removes_what_it_programmed(applied: Appl
 def test_before_it_programs_a_run_removes_what_dead_runs_left_even_its_own(
     applied: Applied,
 ) -> None:
-    told = Told()
+    notices = Notices()
     path = applied.apply(owned=True)
     ledger = path / "programmed.json"
     ledger.write_text(ledger.read_text().replace(f'"pid":{os.getpid()}', '"pid":1'))
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:
         for options, left in ((UpOptions(), 1), (UpOptions(program=(applied.options,)), 0)):
-            open_networks(plan(), options, directory, told.emit, environment=applied.environment)
+            open_networks(plan(), options, directory, notices.emit, environment=applied.environment)
             assert len(applied.server.subscriptions) == left
     finally:
         directory.release()
-    assert told.notices[0].startswith("left by a killed supervisor: nef at ")
+    assert notices.said[0].startswith("left by a killed supervisor: nef at ")
 
 
 def test_a_program_that_somebody_waits_for_is_not_buried_as_an_orphan() -> None:

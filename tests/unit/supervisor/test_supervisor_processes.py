@@ -16,7 +16,6 @@ from typing import Any
 import psutil
 import pytest
 
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Resources, Run, RunKind
 from lifecycle.node.host.control import HostSpec
@@ -55,12 +54,11 @@ class _Bench:
         self.lines: list[str] = []
         self.spoke = asyncio.Event()
         self.emit = Emitter()
-        self.emit.listen(self._hear)
-        self._logs = tmp_path
-        self.said: list[str] = []
+        self.emit.listen(self._take)
+        self._logs = LogDirectory(tmp_path, lambda _: None)
         self._processes: list[ManagedProcess] = []
 
-    def _hear(self, event: object) -> None:
+    def _take(self, event: object) -> None:
         if isinstance(event, LogLine):
             self.lines.append(event.line)
             self.spoke.set()
@@ -74,24 +72,10 @@ class _Bench:
             await process.release()
         await self.fork_server.close()
 
-    async def start(
-        self,
-        *argv: str,
-        environment: tuple[tuple[str, str], ...] = (),
-        resources: Resources | None = None,
-    ) -> Any:
-        process = ManagedProcess(
-            PlannedProcess(
-                name="it",
-                machine="",
-                run=Run(kind=RunKind.COMMAND, command=argv, resources=resources),
-                nodes=("it",),
-                argv=argv,
-                environment=environment,
-            ),
-            logs=LogDirectory(self._logs, self.said.append),
-            emit=self.emit,
-        )
+    async def start(self, *argv: str, resources: Resources | None = None, **how: Any) -> Any:
+        run = Run(kind=RunKind.COMMAND, command=argv, resources=resources)
+        planned = PlannedProcess(name="it", machine="", run=run, nodes=("it",), argv=argv, **how)
+        process = ManagedProcess(planned, logs=self._logs, emit=self.emit)
         self._processes.append(process)
         await process.spawn(self.fork_server, None)
         return process
@@ -155,35 +139,6 @@ async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_grou
         await _ended(process)
         assert process.ended.result() == ProcessExit(signal=signal.SIGKILL)
         grandchild.wait(BOUND_S)
-
-
-async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children_are_ours(
-    tmp_path: Path,
-) -> None:
-    async with _Bench(tmp_path) as bench:
-        first = await bench.start("sleep", "60")
-        server = bench.fork_server
-        os.kill(server.pid, signal.SIGKILL)
-        how = await server.died
-        assert how == f"the fork server (pid {server.pid}) ended unasked: killed by SIGKILL"
-        with pytest.raises(BringUpError) as caught:
-            await bench.start("true")
-        assert str(caught.value) == f"cannot start process 'it': {how}"
-        assert not first.ended.done()
-        await _ended(first)
-        assert first.ended.done()
-
-
-async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(
-    tmp_path: Path,
-) -> None:
-    async with _Bench(tmp_path) as bench:
-        child = await bench.start("sleep", "60")
-        bench.server.socket.shutdown(2)
-        loop = asyncio.get_running_loop()
-        assert await loop.run_in_executor(None, bench.server.popen.wait) == 0
-        assert not psutil.pid_exists(child.pid)
-        await child.ended
 
 
 async def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
@@ -358,11 +313,7 @@ CONFINED = """{command: [bash, -c, 'grep NoNewPrivs /proc/self/status; ulimit -n
 @pytest.mark.parametrize(
     ("run", "printed", "said"),
     [
-        (
-            CONFINED,
-            ["NoNewPrivs:", "1", "77"],
-            "",
-        ),
+        (CONFINED, ["NoNewPrivs:", "1", "77"], ""),
         (
             "{command: ['true'], resources: {memory_max_mib: 64, cpu_quota_percent: 50}}",
             [],

@@ -16,7 +16,6 @@ from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.measure.bounds import Kind
 from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
-from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.ros_interface import (
     BRINGS_UP_S,
     ERROR,
@@ -31,33 +30,30 @@ from lifecycle.supervisor.control.ros_interface import (
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.verify.outcome import Outcome
 from tests import result_schemas
-from tests.unit.supervisor.fakes import run, verdict_of
-from tests.unit.supervisor.session_world import CHAIN, INTRUDED, FakeRosInterface, SessionWorld
+from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.session_world import CHAIN, INTRUDED, SessionWorld
 from tests.unit.supervisor.test_supervisor_output import FLOW, STATUS
 
 OFF, FULL = RosInterfaceAccess.OFF, RosInterfaceAccess.FULL
 
 
-def offering(access: RosInterfaceAccess, plan: Plan = CHAIN) -> Plan:
-    return replace(plan, policy=Policy(ros_interface=access))
+OFFERING = replace(CHAIN, policy=Policy(ros_interface=FULL))
 
 
-def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None:
-    async def main(access: RosInterfaceAccess | None, stop_after_s: float) -> FakeRosInterface:
-        plan = CHAIN if access is None else offering(access)
-        directory = tmp_path / f"{access} {stop_after_s}"
-        directory.mkdir()
-        world = SessionWorld(plan, directory, stop_after_s=stop_after_s)
-        await world.run()
-        return world.graph.ros
-
-    assert run(main(OFF, 3.0)) is None
-    assert run(main(None, 3.0)).services == ("get_status",)
+@pytest.mark.parametrize(
+    ("policy", "services"), [(Policy(), ("get_status",)), (Policy(ros_interface=OFF), None)]
+)
+async def test_it_reads_only_by_default_and_off_leaves_nothing(
+    tmp_path: Path, policy: Policy, services: tuple[str, ...] | None
+) -> None:
+    world = SessionWorld(replace(CHAIN, policy=policy), tmp_path, stop_after_s=3.0)
+    await world.run()
+    assert (world.graph.ros and world.graph.ros.services) == services
 
 
 async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
-    world.graph.unseen.add("/camera")
+    world.hide("/camera")
     async with world.running("[joined] /viewer"):
         await asyncio.sleep(BRINGS_UP_S - 0.2)
         assert world.graph.ros is None
@@ -70,14 +66,9 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
         assert [each[:3] for each in ros.diagnostics[-1]] == [
             (ERROR, "robot: /camera", "inactive"),
             (WARN, "robot: /viewer", "inactive, the system is verifying"),
-            (
-                ERROR,
-                "robot: graph.missing-node",
-                "there is no node /camera in domain 30",
-            ),
+            (ERROR, "robot: graph.missing-node", "there is no node /camera in domain 30"),
         ]
-        world.graph.unseen.clear()
-        world.graph.note()
+        world.hide()
         await world.story.until("[system] active")
         await asyncio.sleep(0.1)
         assert json.loads(ros.statuses[-1])["phase"] == "active"
@@ -117,7 +108,7 @@ def test_what_a_manifest_asks_for_must_be_installed(
 async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_something_changed(
     tmp_path: Path,
 ) -> None:
-    world = SessionWorld(offering(RosInterfaceAccess.READ_ONLY), tmp_path, stop_after_s=9.9)
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=9.9)
     async with world.running("[gate]"):
         assert world.graph.ros is None  # bring-up pays nothing for it
         await world.story.until("[system] active")
@@ -151,7 +142,7 @@ async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_some
 
 
 async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) -> None:
-    world = SessionWorld(offering(FULL), tmp_path)
+    world = SessionWorld(OFFERING, tmp_path)
     async with world.running("[system] active"):
         await asyncio.sleep(0.3)
         ros = world.graph.ros
@@ -175,7 +166,7 @@ async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) ->
 
 
 async def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
-    world = SessionWorld(offering(FULL), tmp_path, stop_after_s=5.0)
+    world = SessionWorld(OFFERING, tmp_path, stop_after_s=5.0)
     async with world.running("[system] active"):
         world.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "pid 7")
         await asyncio.sleep(1.1)
@@ -192,16 +183,9 @@ def test_a_flow_with_declared_numbers_has_an_entry_that_stays_while_it_is_not_me
 
     def measured(outcome: str, text: str) -> FlowMeasurement:
         bound = MeasuredBound(name="max_delay_ms", kind=Kind.DELAY, outcome=outcome, text=text)
-        return FlowMeasurement(
-            topic=FLOW.topic,
-            publisher=FLOW.publisher,
-            subscription=FLOW.subscription,
-            messages=74,
-            lost=1,
-            rate_hz=14.8,
-            p50_ms=0.5,
-            bounds=(bound,),
-        )
+        ends = {"topic": "/video", "publisher": "/camera", "subscription": "/viewer"}
+        numbers = {"messages": 74, "lost": 1, "rate_hz": 14.8, "p50_ms": 0.5}
+        return FlowMeasurement(bounds=(bound,), **ends, **numbers)
 
     reported = Reported()
     name = "robot: /video /camera → /viewer"

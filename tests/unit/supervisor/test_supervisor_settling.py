@@ -10,9 +10,9 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipan
 from lifecycle.supervisor.judging.grace_period import PASSING_S, GracePeriod
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 from tests.builders import endpoint, node, planned, publisher, subscription
-from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.fakes import verdict
 from tests.unit.verify.perfect import perfect
 
 ASK = ("/ask", "not_installed_interfaces/srv/Ask")
@@ -35,48 +35,38 @@ CONNECTED = replace(
 )
 """The same once a connection was negotiated."""
 
-OK = verdict_of(Outcome.OK)
+OK = verdict()
 UNATTRIBUTED = "graph.unattributed-endpoint"
 
 
-def found(*findings: tuple[str, str, str]) -> Verdict:
-    """A violated verdict of (rule, subject, node)."""
-    return Verdict(
-        verdict=Outcome.VIOLATED,
-        blocking=True,
-        findings=tuple(
-            Finding(
-                rule=rule,
-                outcome=Outcome.VIOLATED,
-                subject=subject,
-                expected="",
-                observed="",
-                message="",
-                node=node,
-                endpoint=EndpointKind.PUBLISHER if rule == "graph.missing-endpoint" else None,
-            )
-            for rule, subject, node in findings
-        ),
-        flows=(),
+def found(*findings: tuple[str, ...]) -> Verdict:
+    """A violated verdict; of endpoints publishers are missing."""
+    made = verdict(*findings)
+    missing = (
+        replace(each, endpoint=EndpointKind.PUBLISHER)
+        if each.rule == "graph.missing-endpoint"
+        else each
+        for each in made.findings
     )
+    return replace(made, findings=tuple(missing))
 
 
 NEWS = ("graph.missing-endpoint", "/news", "/talker")
-GONE = ("graph.missing-node", "/talker", "/talker")
+GONE = ("graph.missing-node", "/talker")
 
 
 @pytest.mark.parametrize(
     ("finding", "plan"),
     [
         (NEWS, AFTER),
-        (("flow.wrong-medium", "/news: /talker → /listener", ""), AFTER),
-        (("graph.unmatched-flow", "/news: /talker → /listener", ""), AFTER),
-        (("graph.unmatched-client", "/ask: /talker → /listener", "/talker"), AFTER),
-        (("connection.missing", "/talker", "/talker"), CONNECTED),
+        (("flow.wrong-medium", "/news: /talker → /listener"), AFTER),
+        (("graph.unmatched-flow", "/news: /talker → /listener"), AFTER),
+        (("graph.unmatched-client", "/ask: /talker → /listener"), AFTER),
+        (("connection.missing", "/talker"), CONNECTED),
     ],
 )
 def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
-    finding: tuple[str, str, str], plan: Plan
+    finding: tuple[str, ...], plan: Plan
 ) -> None:
     grace_period = GracePeriod()
     assert grace_period.after(None, OK, BEFORE, 10.0) == (OK, None)
@@ -90,16 +80,16 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
     ("findings", "plan"),
     [
         ([("graph.missing-endpoint", "/chatter", "/talker")], AFTER),
-        ([("flow.wrong-medium", "/chatter: /talker → /listener", "")], AFTER),
+        ([("flow.wrong-medium", "/chatter: /talker → /listener")], AFTER),
         ([GONE], AFTER),
-        ([("connection.missing", "/talker", "/talker")], AFTER),
+        ([("connection.missing", "/talker")], AFTER),
         # It was expected at the first look already.
         ([("graph.missing-endpoint", "/chatter", "/talker")], BEFORE),
         # With whatever else is wrong all of it is said.
         ([NEWS, GONE], AFTER),
     ],
 )
-def test_what_was_expected_before_may_not(findings: list[tuple[str, str, str]], plan: Plan) -> None:
+def test_what_was_expected_before_may_not(findings: list[tuple[str, ...]], plan: Plan) -> None:
     grace_period = GracePeriod()
     grace_period.after(None, OK, BEFORE, 10.0)
     bad = found(*findings)

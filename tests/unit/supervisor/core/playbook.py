@@ -7,9 +7,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import Condition, Restart, Supervision
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import effects, inputs
@@ -17,8 +18,28 @@ from lifecycle.supervisor.core.advance import advance, phase_of
 from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import REACHES, Level, Options, Order, Step, new_run
+from lifecycle.supervisor.run.events import Event, Failure
 from lifecycle.verify.verdict import Verdict
+from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.core.world import verdict
+
+E = TypeVar("E", bound=Event)
+
+AGAIN = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
+INTRUDER = ("graph.undeclared-node", "/intruder")
+GONE = ("graph.missing-node", "/camera")
+
+
+def chain(camera: Supervision = AGAIN, viewer: Supervision = AGAIN) -> Plan:
+    """Return a system in which `viewer` waits for `camera` to be active."""
+    return plan_of(
+        planned_node("camera", supervision=camera),
+        planned_node("viewer", supervision=viewer, after={"camera": Condition.ACTIVE}),
+    )
+
+
+CHAIN = chain(Supervision(), Supervision())
+"""The same, in which nobody is started again."""
 
 
 class Play:
@@ -26,6 +47,7 @@ class Play:
 
     Attributes:
         asked: since `said` was last called.
+        story: all that was asked.
         events: all that was said.
         answers: to orders, by their number.
         found: the verdict of each look.
@@ -35,6 +57,7 @@ class Play:
         self.run = new_run(plan, Options(**options))
         self.ways = dict(ways)
         self.asked: list[str] = []
+        self.story: list[str] = []
         self.events: list[Any] = []
         self.answers: dict[int, tuple[ExitCode, str]] = {}
         self.found: Verdict = verdict()
@@ -51,6 +74,15 @@ class Play:
             if answer is not None:
                 todo += self._step(answer)
         return self.said()
+
+    def finish(self, what: str, error: str = "") -> list[str]:
+        """Have something be answered that hangs; return what is asked then."""
+        held = next(each for each in self.held if _words(each) == what)
+        self.held.remove(held)
+        self.ways[what] = error
+        answer = self._answer(held)
+        del self.ways[what]
+        return self.give(answer)
 
     def said(self) -> list[str]:
         """Return what was asked, looks left out, and forget it."""
@@ -70,10 +102,13 @@ class Play:
     def order(self, ask: ControlRequest, **what: Any) -> list[str]:
         """Order something; its number is that of the orders before it."""
         number = len(self.answers) + len(self.run.orders) + (self.run.order is not None)
-        return self.give(inputs.Ordered(order=Order(id=number, ask=ask, **what)))
+        return self.give(inputs.Ordered(order=Order(**{"id": number, "ask": ask, **what})))
 
     def down(self) -> list[str]:
-        return self.give(inputs.Stop(reason="lifecycle down", code=ExitCode.BRING_UP_FAILED))
+        return self.stop("lifecycle down", ExitCode.BRING_UP_FAILED)
+
+    def stop(self, reason: str, code: ExitCode) -> list[str]:
+        return self.give(inputs.Stop(reason=reason, code=code))
 
     def die(self, process: str, status: int | None = None) -> list[str]:
         number = 11 if status is None else 0
@@ -83,6 +118,21 @@ class Play:
         """Have the next looks find this."""
         self.found = verdict(*found)
         return self.give(inputs.Changed())
+
+    def heard(self, kind: type[E]) -> list[E]:
+        """Events of one kind."""
+        return [each for each in self.events if isinstance(each, kind)]
+
+    @property
+    def failures(self) -> list[tuple[str, str]]:
+        """The node, and what is said, of each failure."""
+        return [(each.subject, each.message) for each in self.heard(Failure)]
+
+    @property
+    def reason(self) -> str:
+        """Why the run ends."""
+        assert self.run.ending is not None
+        return self.run.ending.reason
 
     @property
     def phase(self) -> str:
@@ -110,6 +160,7 @@ class Play:
                 self.answers[each.order] = (each.code, each.error)
             else:
                 self.asked.append(_words(each))
+                self.story.append(_words(each))
                 todo.append(each)
         return todo
 
@@ -119,7 +170,9 @@ class Play:
             self.held.append(effect)
             return None
         if isinstance(effect, effects.Ask):
-            node = self.run.nodes[effect.node]
+            node = self.run.nodes.get(effect.node)
+            if node is None:  # it went while it was asked
+                return inputs.Changed()
             if way == "die":
                 return inputs.Exited(process=node.process, signal=11, text="gone")
             level = node.level if way else REACHES[effect.step]
@@ -155,4 +208,6 @@ def _words(effect: Any) -> str:
         return f"signal {effect.process} {effect.number}"
     if isinstance(effect, effects.Spawn | effects.Sweep):
         return f"{name} {effect.process}"
-    return f"give {effect.node}" if isinstance(effect, effects.Give) else name
+    if isinstance(effect, effects.Give):
+        return f"give {effect.node}{'' if effect.values is None else f' {effect.values.now}'}"
+    return name

@@ -36,9 +36,9 @@ from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import rule
-from lifecycle.verify.verdict import Finding, Verdict
+from lifecycle.verify.verdict import Verdict
 from tests.builders import HERE, plan_of, planned_endpoint, planned_node
+from tests.unit.supervisor.fakes import verdict
 
 STEPS = 6_000
 """No story takes more."""
@@ -63,24 +63,6 @@ class Core:
         self.state, self.inputs, self.effects = module("state"), module("inputs"), module("effects")
         self.advance, self.gate, self.failure = module("advance"), module("gate"), module("failure")
         self.take = module("reduce").take
-
-
-def verdict(*found: tuple[str, str]) -> Verdict:
-    """A verdict that is violated by these rules and nodes; ok by none."""
-    findings = tuple(
-        Finding(
-            rule=rule(name).id,
-            outcome=Outcome.VIOLATED,
-            subject=subject,
-            node=subject,
-            expected="",
-            observed="",
-            message=f"{name} {subject}",
-        )
-        for name, subject in found
-    )
-    outcome = Outcome.VIOLATED if findings else Outcome.OK
-    return Verdict(verdict=outcome, blocking=bool(findings), findings=findings, flows=())
 
 
 def measured(outcome: str, r: random.Random) -> FlowMeasurement:
