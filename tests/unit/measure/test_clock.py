@@ -203,7 +203,7 @@ def test_small_delays_keep_small_buckets_after_long_ones_or_a_clock_that_was_set
 BOUND = Bound(kind=Kind.DELAY, most=5.0)
 
 
-def judged(delay_ms: float, uncertainty_ms: float, seconds: float = 9.0) -> Judgement:
+def judged(delay_ms: float, uncertainty_ms: float, seconds: float = CLOCKS_S) -> Judgement:
     clock = ClockOffset(offset_ms=512, uncertainty_ms=uncertainty_ms)
     sample = counted(steady(delay_ms, seconds), ahead_ns=512_000_000, until_s=seconds)
     return judge(BOUND, sample, clock=clock)
