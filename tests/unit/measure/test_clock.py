@@ -82,6 +82,9 @@ def test_the_uncertainty_is_half_of_the_shortest_round_trip_and_what_clocks_may_
     assert 0.1 < found.uncertainty_ms < 0.1 + 100e-6 * 7100
     later = hosts.known(now_ns + 20 * NS)  # delays of 5 s before are judged, too
     assert later.uncertainty_ms - found.uncertainty_ms == pytest.approx(100e-6 * 15_000, rel=0.1)
+    near = Hosts(500_000_000)
+    at_once = near.known(near.exchange(START, 0, 0, 0))
+    assert at_once == ClockOffset(offset_ms=500.0, uncertainty_ms=0.5000025)
 
 
 def test_nothing_is_known_before_an_exchange() -> None:

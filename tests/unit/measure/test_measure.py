@@ -71,7 +71,17 @@ def test_no_message_has_no_quantile_and_what_came_too_early_counts_as_no_delay()
     assert Delays().quantile_ms(0.99) is None
     assert buckets_of((-5,))[0] == 0
     too_long = buckets_of((LONGEST_NS * 4,))[0]
-    assert Delays.of(({too_long: 1},)).buckets == ((LAST_BUCKET, 1),)
+    both = Delays.of(({too_long: 1}, {-too_long: 2}))
+    assert both == Delays(buckets=((-LAST_BUCKET, 2), (LAST_BUCKET, 1)))
+    edges = (-129, -128, 127, 128, 129, 191, 192)
+    assert [least_ns(each) for each in edges] == [-131, -129, 127, 128, 130, 254, 256]
+
+
+def test_ranks_and_late_messages_are_counted_to_the_nanosecond() -> None:
+    some = Delays(buckets=((1, 1), (2, 1), (3, 1), (5, 1)))
+    assert [some.quantile_ms(each) for each in (0.1, 0.5, 0.51)] == [1e-6, 2e-6, 3e-6]
+    assert Delays(buckets=((1, 1), (2, 1))).quantile_ms(0.99) == 1e-6
+    assert [some.later_than(each) for each in (5e-6, 3e-6, 0.0)] == [0, 1, 4]
 
 
 @given(

@@ -113,6 +113,19 @@ def test_what_cannot_be_decided_yet_is_shown_and_counts_for_nothing() -> None:
     assert bound.decides_in_s == pytest.approx(4.0)
 
 
+def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
+    (of_1, of_5, of_9) = (buckets_of((each * 1_000_000,))[0] for each in (1, 5, 9))
+    used = Delays.of(({of_1: 985, of_5: 10, of_9: 5},), seconds=5.0)
+    sample = replace(arrived(1000, 10, lost=3), used=used)
+    plan = pair(number("max_delay_ms", 5), number("loss", 0.001))
+    (flow,) = judged(plan, sample).measured
+    assert (flow.messages, flow.lost, flow.rate_hz) == (1000, 3, 100.0)
+    assert (flow.p50_ms, flow.p99_ms) == (pytest.approx(1, rel=0.02), pytest.approx(5, rel=0.02))
+    (silent,) = judged(plan, Sample(seconds=1.0)).measured
+    assert (silent.messages, silent.p50_ms, silent.p99_ms) == (0, None, None)
+    assert [each.text for each in silent.bounds] == ["≤ 5 ms", "≤ 0.001"]
+
+
 def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> None:
     verdict = judged(pair(number("max_delay_ms", 5)), None, Stage.CONNECTED)
     assert (verdict.verdict, verdict.measured) == (Outcome.OK, ())
@@ -120,7 +133,7 @@ def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> 
 
 def test_a_number_of_which_nothing_arrives_is_unverifiable_after_the_probation() -> None:
     plan = pair(number("max_delay_ms", 5))
-    assert judged(plan, arrived(0, 9, silent_s=9)).verdict is Outcome.OK
+    assert judged(plan, arrived(0, 10, silent_s=9)).verdict is Outcome.OK
     found = of_data(judged(plan, arrived(0, 11, silent_s=11)))
     assert [(each.rule, each.outcome) for each in found] == [
         ("flow.nothing-arrived", Outcome.UNVERIFIABLE)
