@@ -350,7 +350,7 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max(planned, *matched, 1),
+                several=max((planned, *matched)),
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
                 own=(*flow.planned.quantities, *published),

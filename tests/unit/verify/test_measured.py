@@ -13,7 +13,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import at, link, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import change_configuration, change_report
+from tests.unit.verify.edits import both, change_configuration, change_report
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -124,6 +124,22 @@ def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
     (silent,) = judged(plan, Sample(seconds=1.0)).measured
     assert (silent.messages, silent.p50_ms, silent.p99_ms) == (0, None, None)
     assert [each.text for each in silent.bounds] == ["≤ 5 ms", "≤ 0.001"]
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "judged_"),
+    [("/one", "", 1), ("/one", "activating", 0), ("/two", "inactive", 0), ("/two", "active", 1)],
+)
+def test_nothing_is_judged_while_an_end_says_that_it_is_not_active(
+    name: str, state: str, judged_: int
+) -> None:
+    plan = pair(number("rate_hz", 15))
+    counted = change_configuration(
+        "/two", measured=Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
+    )
+    seen = both(counted, change_configuration(name, state=state))(perfect(plan, Stage.ACTIVE))
+    verdict = verify(plan, seen, stage=Stage.ACTIVE)
+    assert len(verdict.measured) == len(of_data(verdict)) == judged_
 
 
 def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> None:
