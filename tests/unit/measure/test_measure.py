@@ -124,6 +124,7 @@ def test_before_counting_begins_no_time_has_passed_and_a_slot_begins_with_its_fi
 ):
     early = counted([], until_s=-0.2)
     assert (early.seconds, early.silent_s, early.slots) == (0.0, 0.0, ())
+    assert counted([(0.0, 0.0, 1)], until_s=1.0).messages == 1
     sample = counted([(SLOT_S, 1.0, 1)], until_s=2 * SLOT_S)
     assert [each.messages for each in sample.slots] == [1, 0]
 

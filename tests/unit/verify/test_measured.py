@@ -121,6 +121,7 @@ def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
     (flow,) = judged(plan, sample).measured
     assert (flow.messages, flow.lost, flow.rate_hz) == (1000, 3, 100.0)
     assert (flow.p50_ms, flow.p99_ms) == (pytest.approx(1, rel=0.02), pytest.approx(5, rel=0.02))
+    assert flow.describe().endswith("ms ≤ 5 ms, 3 of 1003 lost, measuring ≤ 0.001, 100.0 Hz")
     (silent,) = judged(plan, Sample(seconds=1.0)).measured
     assert (silent.messages, silent.p50_ms, silent.p99_ms) == (0, None, None)
     assert [each.text for each in silent.bounds] == ["≤ 5 ms", "≤ 0.001"]
@@ -196,7 +197,8 @@ def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
     named = [(each.subject, each.expected) for each in of_data(verdict)]
     assert named == [("/a", "loss 0.01"), ("/a: /one → /two", "rate_hz 15")]
     assert [each.name for each in verdict.measured[0].bounds] == ["rate_hz", "max_delay_ms"]
-    assert verdict.measured[0].lost is None
+    shown = "30.0 Hz ≥ 15 Hz - 5%, delay p99 0.999 ms ≤ 5 ms"
+    assert verdict.measured[0].describe() == f"/a /one → /two: {shown}"
 
 
 def test_a_rate_of_a_publisher_is_proven_at_one_subscription_and_its_delay_at_each() -> None:
