@@ -31,7 +31,6 @@ from lifecycle.manifest.names import topic_of
 from lifecycle.network.dscp import (
     ECN_MASK,
     MAX_DSCP,
-    MappedPriority,
     TransportPriorityMapping,
     code_points,
     describe,
@@ -155,7 +154,7 @@ def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking
     """
     if need.transport_priority is not None and need.dscp is None:
         mapping = network.transport_priority_mapping or DIRECT
-        return _mapped(map_priority(need.transport_priority, mapping))
+        return _mapped(need.transport_priority, mapping)
     publishes = need.kind is EndpointKind.PUBLISHER
     if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
         return Marking(dscp=need.dscp)
@@ -165,8 +164,8 @@ def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking
     return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
 
 
-def _mapped(result: MappedPriority) -> Marking:
-    mapping, number = result.mapping, result.priority
+def _mapped(number: int, mapping: TransportPriorityMapping) -> Marking:
+    result = map_priority(number, mapping)
     priority = f"transport_priority {number} ({number:#x})"
     through = f"mask {mapping.mask:#x}, low {mapping.low:#x}, high {mapping.high:#x}"
     if result.tos is None:

@@ -222,7 +222,7 @@ def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgeme
         observed=f"silent for {silent_s:.1f} s",
         allowed=_limit("≤", ">", kept, f"{bound.most:g} s"),
         share=silent_s / bound.most,
-        decides_in_s=max(0.0, bound.most - silent_s) if kept is None else None,
+        decides_in_s=bound.most - silent_s if kept is None else None,
     )
 
 
@@ -232,7 +232,7 @@ def _limit(keeps: str, breaks: str, kept: bool | None, text: str) -> str:
 
 def percentile(quantile: float) -> str:
     """Return `p99` for 0.99, `p99.9` for 0.999."""
-    return f"p{round(quantile * 100, 6):g}"
+    return f"p{quantile * 100:g}"
 
 
 def ms(value: float) -> str:

@@ -56,8 +56,8 @@ class ClockComparison:
     """
 
     def __init__(self) -> None:
-        self._low_ns = self._high_ns = 0
-        self._at_ns: int | None = None  # when the offset was between these
+        # Between which two the offset was, and when.
+        self._known: tuple[int, int, int] | None = None
         self._set_ns: int | None = None
 
     def add(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
@@ -76,14 +76,15 @@ class ClockComparison:
         low, high = t3_ns - t4_ns - drift, t2_ns - t1_ns + drift
         if t4_ns < t1_ns or low > high:
             return  # a clock was set in the middle of it
-        if self._at_ns is not None:
-            drift = _drift_ns(t4_ns - self._at_ns)
-            best = max(low, self._low_ns - drift), min(high, self._high_ns + drift)
+        if self._known is not None:
+            least, most, at_ns = self._known
+            drift = _drift_ns(t4_ns - at_ns)
+            best = max(low, least - drift), min(high, most + drift)
             if best[0] <= best[1]:
                 low, high = best
             else:
                 self._set_ns = t4_ns
-        self._low_ns, self._high_ns, self._at_ns = low, high, t4_ns
+        self._known = low, high, t4_ns
 
     def offset(self, now_ns: int) -> ClockOffset | None:
         """Return the offset of delays that are judged at a time of our clock, and so at that time.
@@ -91,10 +92,11 @@ class ClockComparison:
         None before the first exchange, and while some of these may be from before a clock was set.
         """
         is_new = self._set_ns is not None and abs(now_ns - self._set_ns) < _JUDGED_NS
-        if self._at_ns is None or is_new:
+        if self._known is None or is_new:
             return None
-        drift = max(_drift_ns(each - self._at_ns) for each in (now_ns, now_ns - _JUDGED_NS))
-        low, high = self._low_ns - drift, self._high_ns + drift
+        low, high, at_ns = self._known
+        drift = max(_drift_ns(each - at_ns) for each in (now_ns, now_ns - _JUDGED_NS))
+        low, high = low - drift, high + drift
         return ClockOffset(offset_ms=(low + high) / 2e6, uncertainty_ms=(high - low + 1) / 2e6)
 
 

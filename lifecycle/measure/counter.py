@@ -59,7 +59,6 @@ class Counter:
         self._noted: deque[_Noted] = deque()
         self._published_ns = wall_ns + int(WARM_UP_S * _NS)
         self._last_number = 0
-        self._all: Counts[int] = Counts()
         self._since_ns = self._slot_ns = self._last_ns = now_ns + int(WARM_UP_S * _NS)
         self._messages = 0
         self._lost: int | None = 0
@@ -92,7 +91,6 @@ class Counter:
             self._close_slots(now_ns)
             slots = tuple(each for level in self._levels for each in level)
             used, received = self._recent()
-            whole = Delays.of((self._all,), shift_ns=self._shift_ns)
             return Sample(
                 seconds=max(0.0, (now_ns - self._since_ns) / _NS),
                 silent_s=max(0.0, (now_ns - self._last_ns) / _NS),
@@ -101,8 +99,6 @@ class Counter:
                 slots=slots,
                 used=used,
                 received=received,
-                p50_ms=whole.quantile_ms(0.5),
-                p99_ms=whole.quantile_ms(0.99),
             )
 
     def _recent(self) -> tuple[Delays, Delays]:
@@ -156,9 +152,7 @@ class Counter:
         self._slot_messages += len(used)
         if self.is_apart:
             used, received = self._shifted(used, received)
-        buckets = self._buckets_of(used)
-        self._used.update(buckets)
-        self._all.update(buckets)
+        self._used.update(self._buckets_of(used))
         self._received.update(self._buckets_of(received))
 
     def _shifted(self, used: list[int], received: list[int]) -> tuple[list[int], list[int]]:
@@ -167,7 +161,7 @@ class Counter:
         shift = least if self._shift_ns is None else self._shift_ns
         if not (least - shift > -_BELOW_NS and max(used) - shift < LONGEST_NS):
             shift = least
-            self._all, self._used, self._received = Counts(), Counts(), Counts()
+            self._used, self._received = Counts(), Counts()
             self._delays.clear()
         self._shift_ns = shift
         return [each - shift for each in used], [each - shift for each in received]

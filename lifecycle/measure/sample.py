@@ -64,8 +64,6 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
         slots: the last ones, newest first; older ones are put together, ever more of them.
         used: from publication to the start of the callback, of the last 200 messages or 5 s.
         received: likewise from publication to reception by the RMW.
-        p50_ms: to the start of the callback, of all messages; None without one.
-        p99_ms: likewise.
     """
 
     seconds: float
@@ -75,8 +73,6 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     slots: tuple[Slot, ...] = ()
     used: Delays = Delays()
     received: Delays = Delays()
-    p50_ms: float | None = None
-    p99_ms: float | None = None
 
     def last(self, *, seconds: float = 0.0, published: float = 0.0) -> Slot:
         """Return the shortest recent past that lasts so long and in which so much was published.

@@ -343,9 +343,7 @@ def _check(url: ConnectionUrl) -> None:
 
 
 def _spell(url: ConnectionUrl) -> str:
-    own = str(Peer(address=url.address, port=url.port)) if url.address else ""
-    if not url.address and url.port is not None:
-        own = f":{url.port}"
+    own = Peer(address=url.address, port=url.port)
     default = ConnectionUrl(transport=url.transport)
     words: list[tuple[str, str]] = []
     for name, option in OPTIONS.items():

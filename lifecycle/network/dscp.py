@@ -193,8 +193,6 @@ class MappedPriority(msgspec.Struct, frozen=True, kw_only=True):
         ignored_bits: bits of the priority that made no difference: outside the mask or shifted out.
     """
 
-    priority: int
-    mapping: TransportPriorityMapping
     tos: int | None
     ignored_bits: int
 
@@ -221,14 +219,12 @@ def map_priority(priority: int, mapping: TransportPriorityMapping) -> MappedPrio
         raise ValueError(f"cannot use transport priority {priority}; it does not fit 32 bits")
     bits = priority & _BITS_32
     if mapping.mask == 0:
-        return MappedPriority(priority=priority, mapping=mapping, tos=None, ignored_bits=bits)
+        return MappedPriority(tos=None, ignored_bits=bits)
     shift = 0
     while (mapping.mask >> shift) & 0xFFFF0000:
         shift += 4
     masked, mask = (bits & mapping.mask) >> shift, mapping.mask >> shift
     return MappedPriority(
-        priority=priority,
-        mapping=mapping,
         tos=masked * (mapping.high - mapping.low) // mask + mapping.low,
         ignored_bits=bits & ~(masked << shift),
     )

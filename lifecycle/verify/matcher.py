@@ -181,16 +181,16 @@ def _unknown(
     names: DeclaredNames,
     configurations: dict[str, NodeConfiguration],
 ) -> Iterator[ObservedEndpoint]:
-    """Yield the endpoints whose node discovery does not show, as far as they count."""
+    """Yield the endpoints whose node discovery does not show, each as of its node."""
     by_gid = {
         report.gid: name
         for name, configuration in configurations.items()
         for report in configuration.endpoints
         if report.gid
     }
-    by_participant: dict[str, dict[str, None]] = {}
-    for gid, name in by_gid.items():
-        by_participant.setdefault(gid[:PREFIX_DIGITS], {})[name] = None
+    by_participant: dict[str, list[str]] = {}
+    for prefix, name in dict.fromkeys((gid[:PREFIX_DIGITS], name) for gid, name in by_gid.items()):
+        by_participant.setdefault(prefix, []).append(name)
     for endpoint in endpoints:
         node = by_gid.get(endpoint.gid, "")
         if not node and not endpoint.kind.is_topic:
@@ -203,10 +203,9 @@ def _unknown(
                 ),
                 "",
             )
-        if _counts(endpoint, node, names, ours=node in configurations):
-            # Half of a service may be seen before its node is: it is no second one.
-            known = node and not endpoint.kind.is_topic
-            yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
+        # Half of a service may be seen before its node is: it is no second one.
+        known = node and not endpoint.kind.is_topic
+        yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
 
 
 def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours: bool) -> bool:
@@ -215,7 +214,7 @@ def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours
         (node, endpoint.kind, endpoint.name) in names.ends
         or (node not in names.nodes and names.looks_for(endpoint.kind, endpoint.name))
         or not is_noise_endpoint(
-            endpoint.kind, known_node(endpoint.node), endpoint.name, endpoint.type, ours=ours
+            endpoint.kind, endpoint.node, endpoint.name, endpoint.type, ours=ours
         )
     )
 
@@ -475,7 +474,7 @@ def _not_declared(endpoint: ObservedEndpoint) -> SeenEndpoint:
         type=endpoint.type,
         qos=endpoint.qos,
         type_hash=endpoint.type_hash,
-        expected=False,
+        is_stranger=True,
     )
 
 

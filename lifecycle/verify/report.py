@@ -55,16 +55,17 @@ def render_text(
         verdict: what to write.
         colour: mark outcomes with ANSI colours.
         flows: list the flows too.
-        width: columns to wrap sentences at, >= 40.
+        width: columns to wrap sentences at, 40 at least.
 
     Returns:
         Lines, each ended by a newline.
     """
+    width = max(width, 40)
     lines = [_paint(_headline(verdict), verdict.verdict, colour=colour)]
     for outcome in (Outcome.VIOLATED, Outcome.UNVERIFIABLE):
         findings = [each for each in verdict.findings if each.outcome is outcome]
         for finding in findings:
-            lines += ["", *_finding(finding, colour=colour, width=max(width, 40))]
+            lines += ["", *_finding(finding, colour=colour, width=width)]
     if verdict.open_endpoints:
         lines += ["", "endpoints that `endpoints: open` allows"]
         lines += [
@@ -73,14 +74,14 @@ def render_text(
         ]
     if verdict.tolerated:
         named = ", ".join(each.describe() for each in verdict.tolerated)
-        lines += ["", *_wrap(named, max(width, 40), first="tolerated: ")]
+        lines += ["", *_wrap(named, width, first="tolerated: ")]
     measured = [each for each in verdict.measured if each.bounds]
     if measured:
         lines += ["", "measured", *(one_line(f"  {each.describe()}") for each in measured)]
     if flows and verdict.flows:
         lines += ["", "flows", *_flows(verdict.flows, colour=colour)]
     if verdict.run is not None:
-        lines += ["", *_wrap(verdict.run.describe(), max(width, 40))]
+        lines += ["", *_wrap(verdict.run.describe(), width)]
     return "\n".join(lines) + "\n"
 
 
@@ -193,9 +194,7 @@ class _Cases:
     def of_rule(self, rule: Rule) -> Case:
         """Hold all findings of one rule."""
         found = [each for each in self._verdict.findings if each.rule == rule.id]
-        skipped = ""
-        if not found and not self._verdict.judged:
-            skipped = "not judged; see the end of the run"
+        skipped = "" if found or self._verdict.judged else "not judged; see the end of the run"
         return self._case(rule.id, rule.meaning, found, skipped=skipped)
 
     def of_end(self) -> Case:

@@ -53,8 +53,8 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
         type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
-        expected: it is one that the system has for good, so that whatever can match it must; a
-            tool's may be matched or not.
+        is_stranger: it is none that the system has for good: whatever can match it may be matched
+            with it or not.
         observed: discovery or its node shows it; else it is known from its declaration alone.
     """
 
@@ -66,7 +66,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     report: EndpointReport | None = None
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
-    expected: bool = True
+    is_stranger: bool = False
     observed: bool = True
 
 

@@ -289,7 +289,7 @@ def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | No
     reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched none"
     if matched == len(possible):
         return _OK
-    if matched < len(possible) and (matched == 0 or all(each.expected for each in possible)):
+    if matched < len(possible) and (matched == 0 or not any(each.is_stranger for each in possible)):
         return Outcome.VIOLATED, reason
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
 

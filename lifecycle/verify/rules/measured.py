@@ -35,39 +35,29 @@ PROBATION_S = 10.0
 _FIVE_QI_QUANTILE = 0.98
 _DELAYS = frozenset({Kind.DELAY, Kind.NETWORK_DELAY})
 
-
-def _rule(id_: str, meaning: str, fix: str) -> Rule:
-    return Rule(
-        id=id_,
-        meaning=meaning,
-        outcomes=(Outcome.VIOLATED,),
-        fix=fix,
-        heals=Heals.WITH_TIME,
-        measured=True,
-    )
-
+_rule = functools.partial(Rule, outcomes=(Outcome.VIOLATED,), heals=Heals.WITH_TIME, measured=True)
 
 DELAY = _rule(
-    "flow.delay",
-    "data arrive later than the manifest allows",
-    "see what is slow: the network (`lifecycle flows`, `--program`), or the subscribing node, whose"
-    " callbacks begin late",
+    id="flow.delay",
+    meaning="data arrive later than the manifest allows",
+    fix="see what is slow: the network (`lifecycle flows`, `--program`), or the subscribing node,"
+    " whose callbacks begin late",
 )
 RATE = _rule(
-    "flow.rate",
-    "data arrive less often, or more often, than the manifest says",
-    "see whether the publisher is slow, or what is lost on the way",
+    id="flow.rate",
+    meaning="data arrive less often, or more often, than the manifest says",
+    fix="see whether the publisher is slow, or what is lost on the way",
 )
 LOSS = _rule(
-    "flow.loss",
-    "more messages are lost than the manifest allows",
-    "lost is what does not reach the callback: on the network, or because a QoS depth is too small"
-    " for a callback that is slow",
+    id="flow.loss",
+    meaning="more messages are lost than the manifest allows",
+    fix="lost is what does not reach the callback: on the network, or because a QoS depth is too"
+    " small for a callback that is slow",
 )
 SILENT = _rule(
-    "flow.silent",
-    "nothing has arrived for longer than the manifest allows",
-    "see whether the publisher publishes; its node is active and matched",
+    id="flow.silent",
+    meaning="nothing has arrived for longer than the manifest allows",
+    fix="see whether the publisher publishes; its node is active and matched",
 )
 NOT_MEASURED = Rule(
     id="flow.not-measured",
@@ -397,7 +387,7 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max(planned, *matched, 1),
+                several=max((planned, *matched)),
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
                 own=(*flow.planned.quantities, *published),

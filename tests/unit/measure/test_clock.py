@@ -82,6 +82,9 @@ def test_the_uncertainty_is_half_of_the_shortest_round_trip_and_what_clocks_may_
     assert 0.1 < found.uncertainty_ms < 0.1 + 100e-6 * 7100
     later = hosts.known(now_ns + 20 * NS)  # delays of 5 s before are judged, too
     assert later.uncertainty_ms - found.uncertainty_ms == pytest.approx(100e-6 * 15_000, rel=0.1)
+    near = Hosts(500_000_000)
+    at_once = near.known(near.exchange(START, 0, 0, 0))
+    assert at_once == ClockOffset(offset_ms=500.0, uncertainty_ms=0.5000025)
 
 
 def test_nothing_is_known_before_an_exchange() -> None:
@@ -203,7 +206,7 @@ def test_small_delays_keep_small_buckets_after_long_ones_or_a_clock_that_was_set
 BOUND = Bound(kind=Kind.DELAY, most=5.0)
 
 
-def judged(delay_ms: float, uncertainty_ms: float, seconds: float = 9.0) -> Judgement:
+def judged(delay_ms: float, uncertainty_ms: float, seconds: float = CLOCKS_S) -> Judgement:
     clock = ClockOffset(offset_ms=512, uncertainty_ms=uncertainty_ms)
     sample = counted(steady(delay_ms, seconds), ahead_ns=512_000_000, until_s=seconds)
     return judge(BOUND, sample, clock=clock)

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, too_many_late
+from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, ms, percentile, too_many_late
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, buckets_of, least_ns
-from lifecycle.measure.sample import DELAY_S, SLOT_S, Sample
+from lifecycle.measure.sample import DELAY_S, SLOT_S, Sample, Slot
 
 NS = 10**9
 WALL = 1_700_000_000 * NS
@@ -71,7 +71,17 @@ def test_no_message_has_no_quantile_and_what_came_too_early_counts_as_no_delay()
     assert Delays().quantile_ms(0.99) is None
     assert buckets_of((-5,))[0] == 0
     too_long = buckets_of((LONGEST_NS * 4,))[0]
-    assert Delays.of(({too_long: 1},)).buckets == ((LAST_BUCKET, 1),)
+    both = Delays.of(({too_long: 1}, {-too_long: 2}))
+    assert both == Delays(buckets=((-LAST_BUCKET, 2), (LAST_BUCKET, 1)))
+    edges = (-129, -128, 127, 128, 129, 191, 192)
+    assert [least_ns(each) for each in edges] == [-131, -129, 127, 128, 130, 254, 256]
+
+
+def test_ranks_and_late_messages_are_counted_to_the_nanosecond() -> None:
+    some = Delays(buckets=((1, 1), (2, 1), (3, 1), (5, 1)))
+    assert [some.quantile_ms(each) for each in (0.1, 0.5, 0.51)] == [1e-6, 2e-6, 3e-6]
+    assert Delays(buckets=((1, 1), (2, 1))).quantile_ms(0.99) == 1e-6
+    assert [some.later_than(each) for each in (5e-6, 3e-6, 0.0)] == [0, 1, 4]
 
 
 @given(
@@ -93,6 +103,7 @@ def test_what_is_counted_is_what_arrived(steps: list[tuple[float, float, int]]) 
     past = sample.last(seconds=1e9)
     assert past.seconds == math.floor((end_s + 1e-9) / SLOT_S) * SLOT_S
     assert past.messages == sum(each[0] < past.seconds for each in arrivals)
+    assert past.lost == sample.lost
     assert len(sample.slots) < 100
 
 
@@ -105,10 +116,30 @@ def test_what_was_published_before_activation_or_arrives_just_after_it_does_not_
 def test_a_publisher_that_is_started_again_has_lost_nothing() -> None:
     sample = counted([(0.1, 1, 41), (0.2, 1, 42), (0.3, 1, 1), (0.4, 1, 3)], until_s=1.0)
     assert (sample.messages, sample.lost) == (4, 1)
+    assert counted([(0.1, 1, 5), (0.2, 1, 5)], until_s=1.0).lost == 0
 
 
-def test_an_rmw_without_sequence_numbers_has_an_unknown_loss() -> None:
-    assert counted([(0.1, 1, 2**64 - 1)], until_s=1.0).lost is None
+def test_before_counting_begins_no_time_has_passed_and_a_slot_begins_with_its_first_moment() -> (
+    None
+):
+    early = counted([], until_s=-0.2)
+    assert (early.seconds, early.silent_s, early.slots) == (0.0, 0.0, ())
+    assert counted([(0.0, 0.0, 1)], until_s=1.0).messages == 1
+    sample = counted([(SLOT_S, 1.0, 1)], until_s=2 * SLOT_S)
+    assert [each.messages for each in sample.slots] == [1, 0]
+
+
+@pytest.mark.parametrize("number", [0, 2**63, 2**64 - 1])
+def test_an_rmw_without_sequence_numbers_has_an_unknown_loss(number: int) -> None:
+    assert counted([(0.1, 1, number)], until_s=1.0).lost is None
+
+
+def test_an_rmw_that_does_not_say_when_it_received_a_message_has_no_delay_of_the_network() -> None:
+    counter = Counter(0, WALL)
+    names = ("source_timestamp", "received_timestamp", "publication_sequence_number")
+    counter.arrived(NS, WALL + NS, dict(zip(names, (WALL + NS - 1000, 0, 1), strict=True)))
+    sample = counter.sample(2 * NS)
+    assert (sample.used.messages, sample.received.messages) == (1, 0)
 
 
 def test_memory_is_bounded_however_long_it_counts() -> None:
@@ -134,6 +165,12 @@ def test_a_delay_is_judged_after_200_messages_or_5_s() -> None:
     assert verdict(DELAY, counted(steady(2, 5), until_s=DELAY_S)) is True
     assert verdict(DELAY, counted([], until_s=60)) is None
     assert verdict(DELAY, counted(steady(100, 2.5, delay_ms=8), until_s=2.5)) is False
+    for hertz, messages, seconds in ((100, 200, 2.0), (2, 10, DELAY_S)):
+        sample = counted(steady(hertz, 20), until_s=20)
+        for each in (sample.used, sample.received):
+            assert (each.messages, each.seconds) == (messages, seconds)
+    at_the_bound = Sample(seconds=5.0, used=Delays(seconds=DELAY_S, buckets=((64, 9),)))
+    assert verdict(Bound(kind=Kind.DELAY, most=64e-6), at_the_bound) is True
 
 
 def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
@@ -173,6 +210,7 @@ def test_too_many_late_messages_are_in_about_1_percent_of_samples(
     chance = sum(map(math.exp, logs))
     assert chance < 0.0125 or number == messages
     assert number > messages * share
+    assert [too_many_late(*each) for each in ((1, 0.1), (200, 0.01), (100, 0.5))] == [1, 7, 63]
 
 
 def test_reception_is_judged_for_the_network() -> None:
@@ -191,6 +229,11 @@ def test_a_rate_is_judged_after_2_s_and_20_periods() -> None:
     slow = Bound(kind=Kind.RATE, least=1.0, slack=0.05)
     assert verdict(slow, counted(steady(1, 19), until_s=19)) is None
     assert verdict(slow, counted(steady(1, 20), until_s=20)) is True
+    # Where a slot begins makes a difference of one message.
+    exactly = Bound(kind=Kind.RATE, least=15.0, most=15.0)
+    slots = (Slot(seconds=2.0, messages=each) for each in (28, 29, 31, 32))
+    samples = (Sample(seconds=2.0, messages=30, slots=(each,)) for each in slots)
+    assert [verdict(exactly, each) for each in samples] == [False, True, True, False]
 
 
 def test_a_rate_may_have_an_upper_bound() -> None:
@@ -204,11 +247,14 @@ def test_a_publisher_that_was_activated_just_now_has_no_rate_yet_and_is_not_sile
     sample = counted(steady(15, 2), until_s=60)
     assert verdict(RATE, sample) is False
     assert verdict(RATE, sample, publishes_s=1.0) is None
+    assert verdict(RATE, sample, publishes_s=3.0) is False
     silence = Bound(kind=Kind.SILENCE, most=2.0)
     assert verdict(silence, sample) is False
     assert verdict(silence, sample, publishes_s=1.0) is True
     assert verdict(silence, counted([], until_s=1.0)) is None
     assert verdict(silence, counted([], until_s=3.0)) is False
+    assert verdict(silence, Sample(seconds=9.0, messages=1, silent_s=2.0)) is True
+    assert judge(silence, sample, publishes_s=0.5).observed == "silent for 0.0 s"
 
 
 LOSS = Bound(kind=Kind.LOSS, most=0.01)
@@ -227,7 +273,10 @@ def test_a_loss_is_judged_after_ten_losses_or_as_many_messages_as_would_have_the
 def test_a_loss_is_compared_with_the_exact_share(number: int) -> None:
     dropped = frozenset(range(20, 20 + 15 * number, 15))
     sample = counted(steady(100, 10, lost=dropped), until_s=10)
-    assert verdict(LOSS, sample) is (number <= 10)
+    found = judge(LOSS, sample)
+    assert (found.kept, found.share) == (number <= 10, pytest.approx(number / 10))
+    sign = "≤" if found.kept else ">"
+    assert (found.observed, found.allowed) == (f"{number} of 1000 lost", f"{sign} 0.01")
 
 
 @pytest.mark.parametrize(
@@ -244,22 +293,50 @@ def test_a_judgement_has_numbers(bound: Bound, expected: Judgement) -> None:
 
 
 @pytest.mark.parametrize(
-    ("bound", "hertz", "share"),
+    ("bound", "share", "allowed"),
     [
-        (Bound(kind=Kind.DELAY, most=4), 15, 0.25),
-        (Bound(kind=Kind.DELAY, most=0.5), 15, 2),
-        (Bound(kind=Kind.RATE, least=30, slack=0.05), 15, 0.5),
-        (Bound(kind=Kind.RATE, least=5, most=10), 15, 1.5),
-        (Bound(kind=Kind.RATE, least=10, most=20), 15, 1.5),
-        (Bound(kind=Kind.RATE, most=20), 15, 0.75),
-        (Bound(kind=Kind.LOSS, most=0.2), 15, 0),
-        (Bound(kind=Kind.SILENCE, most=1), 15, 0.03),
+        (Bound(kind=Kind.DELAY, most=4), 0.25, "≤ 4 ms"),
+        (Bound(kind=Kind.DELAY, most=0.5), 2, "> 0.5 ms"),
+        (Bound(kind=Kind.RATE, least=30, slack=0.05), 0.5, "< 30 Hz - 5%"),
+        (Bound(kind=Kind.RATE, least=5, most=10), 1.5, "> 10 Hz"),
+        (Bound(kind=Kind.RATE, least=10, most=20), 1.5, "≥ 10 Hz"),
+        (Bound(kind=Kind.RATE, most=20), 0.75, "≤ 20 Hz"),
+        (Bound(kind=Kind.LOSS, most=0.2), 0, "≤ 0.2"),
+        (Bound(kind=Kind.SILENCE, most=1), 0.03, "≤ 1 s"),
+        (Bound(kind=Kind.SILENCE, most=0.01), 3.3, "> 0.01 s"),
     ],
 )
 def test_a_judgement_has_what_share_of_the_bound_was_measured(
-    bound: Bound, hertz: float, share: float
+    bound: Bound, share: float, allowed: str
 ) -> None:
-    found = judge(bound, counted(steady(hertz, 5), until_s=5)).share
-    assert found == pytest.approx(share, rel=0.05, abs=0.01)
-    nothing = Sample(seconds=0.0)
-    assert not judge(bound, nothing).share
+    found = judge(bound, counted(steady(15, 5), until_s=5))
+    assert found.share == pytest.approx(share, rel=0.05, abs=0.01)
+    assert (found.allowed, found.decides_in_s) == (allowed, None)
+    nothing = judge(bound, Sample(seconds=0.0))
+    assert nothing.share in (None, 0.0)
+    assert nothing.observed in ("", "silent for 0.0 s")
+
+
+@pytest.mark.parametrize(
+    ("bound", "hertz", "seconds", "publishes_s", "left_s"),
+    [
+        (DELAY, 2, 4.5, None, 0.5),
+        (RATE, 15, 1.5, None, 1.0),
+        (Bound(kind=Kind.RATE, least=1.0), 1, 5, None, 15.0),
+        (RATE, 15, 60, 1.0, 3.0),
+        (LOSS, 100, 5, None, 5.0),
+        (LOSS, 0.1, 1, None, None),
+        (Bound(kind=Kind.SILENCE, most=2.5), 0.1, 1, None, 1.5),
+    ],
+)
+def test_what_is_not_decided_yet_says_how_long_that_takes(
+    bound: Bound, hertz: float, seconds: float, publishes_s: float | None, left_s: float | None
+) -> None:
+    found = judge(bound, counted(steady(hertz, seconds), until_s=seconds), publishes_s=publishes_s)
+    assert (found.kept, found.decides_in_s) == (None, left_s)
+
+
+def test_quantiles_and_milliseconds_are_written_as_people_read_them() -> None:
+    assert [percentile(each) for each in (0.5, 0.99, 0.999)] == ["p50", "p99", "p99.9"]
+    shown = [ms(each) for each in (0.6123, 58.24, 999.0, 1000.0, 1234.5)]
+    assert shown == ["0.612 ms", "58.2 ms", "999 ms", "1000 ms", "1234 ms"]

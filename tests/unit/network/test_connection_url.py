@@ -13,6 +13,7 @@ from lifecycle.network.connection_url import (
     ConnectionUrl,
     ConnectionUrlError,
     Peer,
+    check_together,
     parse,
 )
 from lifecycle.network.medium import Medium
@@ -161,6 +162,58 @@ def test_what_cannot_be_read_is_said_whole(text: str, problem: str, hint: str):
     assert error.value.hint == hint
 
 
+@pytest.mark.parametrize(
+    ("urls", "problem", "hint"),
+    [
+        (
+            ("udpv4://", "udpv4://10.0.0.1:1"),
+            "use {} on all interfaces and {} on some: one participant has one transport for both",
+            "give both an address or interface=",
+        ),
+        *(
+            (each, f"use {{}} and {{}} together: one participant has one {what}", "")
+            for each, what in (
+                (("udpm://239.1.1.1:1?ttl=0", "udpv4://?ttl=1"), "ttl"),
+                (("udpv4://?output_port=1", "udpv4://?output_port=2"), "output_port"),
+                (
+                    ("udpv4://?metatraffic_port=1", "udpv4://?metatraffic_port=2"),
+                    "metatraffic_port",
+                ),
+                (("tcpv4://:5100", "tcpv4://:5101"), "TCP port"),
+            )
+        ),
+        (
+            ("shm://", "udpv4://:7911"),
+            (
+                "use {} beside {}: a profile with fixed ports cannot say where shared memory"
+                " listens, so it would not"
+            ),
+            "leave shm:// or the port out",
+        ),
+        (
+            ("udpv4://?peer=10.0.0.2", "tcpv4://?server=10.0.0.1:1"),
+            "look for peers {} as a client of {}: a client of a discovery server finds nobody else",
+            "leave peer= or server= out",
+        ),
+        (("shm://", "udpv4://"), "", ""),
+        (("shm://", "tcpv4://:5100"), "", ""),
+        (("udpm://239.1.1.1:1", "udpv4://10.0.0.1:1", "udpv4://10.0.0.1:2"), "", ""),
+        (("udpm://[ff02::1]:1?ttl=0", "udpv4://?ttl=1", "udpv4://"), "", ""),
+        (("udpv4://?peer=10.0.0.1", "tcpv4://10.0.0.1:5100?peer=10.0.0.2"), "", ""),
+    ],
+)
+def test_what_one_participant_cannot_have_together_is_said_whole(
+    urls: tuple[str, ...], problem: str, hint: str
+) -> None:
+    if not problem:
+        check_together([parse(each) for each in urls])
+        return
+    with pytest.raises(ConnectionUrlError) as error:
+        check_together([parse(each) for each in urls])
+    assert error.value.message == f"cannot {problem.format(*map(repr, urls))}"
+    assert error.value.hint == (hint or "give them to different connections")
+
+
 _PORTS = st.integers(1, 65535)
 _V4 = st.ip_addresses(v=4).filter(lambda each: not each.is_multicast).map(str)
 _V6 = st.ip_addresses(v=6).filter(lambda each: not each.is_multicast).map(str)
@@ -227,9 +280,3 @@ def test_a_slash_after_the_port_is_no_path() -> None:
     assert parse("udpv4://10.77.0.1:7911/") == parse("udpv4://10.77.0.1:7911")
     with pytest.raises(ConnectionUrlError, match="only address, port and options"):
         parse("udpv4://10.77.0.1:7911/x")
-
-
-def test_colons_and_brackets_of_addresses_are_spelled_as_they_are() -> None:
-    text = "udpv6://[fd77::1]:7911?peer=[fd77::2]:7910"
-    assert str(parse(text)) == text
-    assert str(parse("shm://")) == "shm://"

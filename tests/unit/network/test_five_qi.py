@@ -125,6 +125,7 @@ def test_an_issue_names_what_is_asked_for_and_what_the_class_has() -> None:
         (10, 1e-3, True, 82),
         (10, 1e-6, None, 80),
         (1000, 1, None, 76),
+        (100, 1e-2, True, 1),  # 5QI 66 differs in nothing that is compared
     ],
 )
 def test_the_least_demanding_class_that_fits_is_proposed(
@@ -158,6 +159,7 @@ def test_classes_with_a_doubtful_cell_are_not_proposed() -> None:
         ((1, 1e-3, True, None, None), "the shortest delay budget is 5 ms, of 5QI 85"),
         ((500, 1e-9, None, None, None), "the lowest error rate is 1e-08, of 5QI 73 (GBR)"),
         ((5, 1e-5, True, 256, None), "the largest burst is 255 bytes, of 5QI 85"),
+        ((30, 1e-3, True, 70_000, None), "the largest burst is 63000 bytes, of 5QI 90"),
         ((5, 1, True, None, 1e9), "the highest rate is 2.1664e+06 bit/s, of 5QI 86"),
     ],
 )
@@ -211,10 +213,3 @@ def test_a_proposed_class_keeps_what_was_asked_and_a_refusal_means_that_none_doe
     ]
     assert (found is None) == (not keeping)
     assert found is None or found in keeping
-
-
-def test_of_equal_classes_the_one_with_the_lowest_number_is_proposed() -> None:
-    # 5QI 1 and 66 differ in nothing that is compared.
-    found = propose(100, 1e-2, True).five_qi
-    assert found is not None
-    assert found.value == 1

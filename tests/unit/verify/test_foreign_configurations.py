@@ -154,6 +154,14 @@ def test_what_is_refused_is_quoted_no_longer_than_a_line() -> None:
             second(nfes=[{**NFE, "internet_address": "y" * 200}]),
             f"endpoints[1].nfes.internet_address is '{'y' * 100}'; allowed: an IP address",
         ),
+        (
+            edited(connections=[{"name": "a", "prefix": "ab" * 12}, {"name": "b", "prefix": "a"}]),
+            "connections[1].prefix is 'a'; allowed: 24 hex digits, or none",
+        ),
+        (
+            edited(parameters=[{"name": "p", "type": "integer_array", "value": [1, 2**63]}]),
+            f"parameters.p is '{2**63}'; allowed: {-LARGEST - 1}–{LARGEST}",
+        ),
         (edited(name="x" * 200), f"it is that of node '{'x' * 100}'"),
     ):
         with pytest.raises(ConfigurationError) as caught:

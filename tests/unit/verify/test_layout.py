@@ -6,14 +6,13 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.verify.matcher import lay_out
-from lifecycle.verify.observation import (
-    Observation,
-)
+from lifecycle.verify.observation import Observation, ObservedEndpoint
 from lifecycle.verify.verdict import Stage
-from lifecycle.verify.view import Actual, View
+from lifecycle.verify.view import Actual, View, actual_qos
 from tests.builders import (
     node,
     planned,
@@ -50,12 +49,6 @@ def actual(view: View, kind: EndpointKind, name: str) -> Actual:
     return found
 
 
-# --- nodes
-
-
-# --- reports
-
-
 # --- whose an endpoint is
 
 
@@ -74,6 +67,8 @@ def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_ac
     dock = "/robot/dock/_action"
     view = view_after(nameless_service(f"{dock}/send_goal", type_="robot/action/Dock_SendGoal"))
     assert (view.unattributed, view.undeclared, view.foreign) == ((), (), ())
+    # It is no second one beside that which the node shows, and so has no GID of its own.
+    assert "" in {each.gid for each in view.groups["/robot/camera"] if not each.kind.is_topic}
     view = view_after(nameless_service("/other/_action/send_goal"))
     assert [each.name for each in view.unattributed] == ["/other/_action/send_goal"]
 
@@ -84,12 +79,14 @@ def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_ac
 def test_a_nameless_report_of_the_declared_type_is_chosen_where_discovery_shows_none() -> None:
     plan = connected("udpv4://10.0.0.1:7911")
     report = perfect(plan).configurations[0].endpoints[0]
-    right = replace(report, name="")
+    right = replace(report, name="", type_hash="h")
     wrong = replace(right, type="std_msgs/msg/Int32", gid="99")
     edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(wrong, right)))
     view = view_after(edit, plan)
     assert actual(view, PUB, "/a").report == right
-    assert actual(view, PUB, "/a").observed.type == STRING
+    assert actual(view, PUB, "/a").observed == ObservedEndpoint(
+        kind=PUB, node="/one", name="/a", type=STRING, qos=right.qos, gid=right.gid, type_hash="h"
+    )
     assert [each.type for each in view.undeclared] == ["std_msgs/msg/Int32"]
 
 
@@ -107,6 +104,30 @@ def connected(url: str) -> Plan:
 
 
 # --- what is seen of topics
+
+
+def test_discovery_wins_over_a_report_where_it_knows_a_policy() -> None:
+    known = QosProfile(
+        history=History.KEEP_ALL,
+        depth=3,
+        reliability=Reliability.BEST_EFFORT,
+        durability=Durability.TRANSIENT_LOCAL,
+        deadline_ns=7,
+        lifespan_ns=8,
+        liveliness=Liveliness.MANUAL_BY_TOPIC,
+        liveliness_lease_duration_ns=9,
+    )
+    reported = QosProfile(depth=4, deadline_ns=1, lifespan_ns=2, liveliness_lease_duration_ns=3)
+    assert actual_qos(known, reported) == known
+    policies = {
+        "history": History.UNKNOWN,
+        "reliability": Reliability.UNKNOWN,
+        "durability": Durability.UNKNOWN,
+        "liveliness": Liveliness.UNKNOWN,
+    }
+    times = {each: getattr(known, each) for each in QosProfile.__struct_fields__ if "_ns" in each}
+    assert actual_qos(replace(known, depth=0, **policies), reported) == replace(reported, **times)
+    assert (actual_qos(known, None), actual_qos(None, known)) == (known, known)
 
 
 @pytest.mark.parametrize(
@@ -131,6 +152,3 @@ def test_the_hash_that_discovery_shows_wins_over_the_reported_one(shown, reporte
     foreign = add_endpoint(PUB, "/guest", "/x", gid="99", type_hash=shown)
     (seen,) = (each for each in view_after(foreign).seen if each.node == "/guest")
     assert seen.type_hash == shown
-
-
-# --- flows

@@ -13,7 +13,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import at, link, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import change_configuration, change_report
+from tests.unit.verify.edits import both, change_configuration, change_report
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -113,6 +113,36 @@ def test_what_cannot_be_decided_yet_is_shown_and_counts_for_nothing() -> None:
     assert bound.decides_in_s == pytest.approx(4.0)
 
 
+def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
+    (of_1, of_5, of_9) = (buckets_of((each * 1_000_000,))[0] for each in (1, 5, 9))
+    used = Delays.of(({of_1: 985, of_5: 10, of_9: 5},), seconds=5.0)
+    sample = replace(arrived(1000, 10, lost=3), used=used)
+    plan = pair(number("max_delay_ms", 5), number("loss", 0.001))
+    (flow,) = judged(plan, sample).measured
+    assert (flow.messages, flow.lost, flow.rate_hz) == (1000, 3, 100.0)
+    assert (flow.p50_ms, flow.p99_ms) == (pytest.approx(1, rel=0.02), pytest.approx(5, rel=0.02))
+    assert flow.describe().endswith("ms ≤ 5 ms, 3 of 1003 lost, measuring ≤ 0.001, 100.0 Hz")
+    (silent,) = judged(plan, Sample(seconds=1.0)).measured
+    assert (silent.messages, silent.p50_ms, silent.p99_ms) == (0, None, None)
+    assert [each.text for each in silent.bounds] == ["≤ 5 ms", "≤ 0.001"]
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "judged_"),
+    [("/one", "", 1), ("/one", "activating", 0), ("/two", "inactive", 0), ("/two", "active", 1)],
+)
+def test_nothing_is_judged_while_an_end_says_that_it_is_not_active(
+    name: str, state: str, judged_: int
+) -> None:
+    plan = pair(number("rate_hz", 15))
+    counted = change_configuration(
+        "/two", measured=Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
+    )
+    seen = both(counted, change_configuration(name, state=state))(perfect(plan, Stage.ACTIVE))
+    verdict = verify(plan, seen, stage=Stage.ACTIVE)
+    assert len(verdict.measured) == len(of_data(verdict)) == judged_
+
+
 def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> None:
     verdict = judged(pair(number("max_delay_ms", 5)), None, Stage.CONNECTED)
     assert (verdict.verdict, verdict.measured) == (Outcome.OK, ())
@@ -120,7 +150,7 @@ def test_before_activation_nothing_is_measured_and_nothing_is_unverifiable() -> 
 
 def test_a_number_of_which_nothing_arrives_is_unverifiable_after_the_probation() -> None:
     plan = pair(number("max_delay_ms", 5))
-    assert judged(plan, arrived(0, 9, silent_s=9)).verdict is Outcome.OK
+    assert judged(plan, arrived(0, 10, silent_s=9)).verdict is Outcome.OK
     found = of_data(judged(plan, arrived(0, 11, silent_s=11)))
     assert [(each.rule, each.outcome) for each in found] == [
         ("flow.nothing-arrived", Outcome.UNVERIFIABLE)
@@ -167,7 +197,8 @@ def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
     named = [(each.subject, each.expected) for each in of_data(verdict)]
     assert named == [("/a", "loss 0.01"), ("/a: /one → /two", "rate_hz 15")]
     assert [each.name for each in verdict.measured[0].bounds] == ["rate_hz", "max_delay_ms"]
-    assert verdict.measured[0].lost is None
+    shown = "30.0 Hz ≥ 15 Hz - 5%, delay p99 0.999 ms ≤ 5 ms"
+    assert verdict.measured[0].describe() == f"/a /one → /two: {shown}"
 
 
 def test_a_rate_of_a_publisher_is_proven_at_one_subscription_and_its_delay_at_each() -> None:

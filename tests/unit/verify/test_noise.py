@@ -219,6 +219,15 @@ def test_parts_of_another_type_stay_beside_their_action():
     wrong = [replace(each, type="std_msgs/msg/String") for each in some[-2:]]
     action, *left = fold_actions([*some[:-2], *wrong])
     assert (action.type, left) == ("robot/action/Dock", wrong)
+    none_right = [replace(each, type="std_msgs/msg/String") for each in some]
+    action, *left = fold_actions(none_right)
+    assert (action.type, left) == ("", none_right)
+
+
+def test_parts_of_an_action_client_that_is_there_already_are_no_second_one():
+    known = ObservedEndpoint(kind=ACTION_CLIENT, node="/ui", name="/dock", type="robot/action/Dock")
+    of_client = [replace(each, node="/ui", kind=each.kind.other_end) for each in parts()]
+    assert fold_actions([known, *of_client, *parts()]) == (known, *fold_actions(parts()))
 
 
 def test_observers_notice_each_other_by_topics_that_are_nobody_elses():

@@ -58,9 +58,6 @@ def silent(kind: EndpointKind) -> Edit:
     return change_report(kind, "/a", matched=None)
 
 
-# --- whole findings
-
-
 # --- why a link cannot be matched at all
 
 TYPES = change_endpoint(PUB, "/a", type=INT)

@@ -224,6 +224,14 @@ def test_a_bad_verdict_says_what_was_expected_and_observed_where_and_what_to_do(
     assert render_text(after(BAD), flows=False, width=80) == BAD_TEXT
 
 
+@pytest.mark.parametrize(("how", "columns"), [({}, 100), ({"width": 60}, 60), ({"width": 1}, 40)])
+def test_sentences_are_wrapped_between_words_at_40_columns_at_least(how, columns):
+    words, whole = ("x" * 20, "y" * (columns - 23)), "/" + "a-" * columns
+    finding = replace(VIOLATED, message=" ".join((*words, whole, *words)) + "y")
+    lines = render_text(replace(WRITTEN, findings=(finding,)), **how).splitlines()[3:7]
+    assert lines == [f"  {' '.join(words)}", f"  {whole}", f"  {words[0]}", f"  {words[1]}y"]
+
+
 def test_colour_comes_only_when_asked_for():
     assert "\x1b" not in render_text(after(BAD))
     red, yellow, green, reset = "\x1b[31m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
@@ -446,6 +454,8 @@ def test_what_may_be_unverifiable_neither_fails_nor_skips_a_test():
     policy = replace(PLAN.policy, unverifiable="block")
     blocking = replace(PLAN, policy=policy)
     assert list(cases(unverifiable, blocking).values()).count("failure") == 1
+    trusting = replace(PLAN, policy=replace(policy, trust=("flow.dscp-unverifiable",)))
+    assert "failure" not in cases(unverifiable, trusting, strict=True).values()
 
 
 def test_what_refuses_nothing_is_placed_at_the_first_declaration():

@@ -208,9 +208,6 @@ def test_container_bridges_of_one_address_do_not_make_two_machines_share_a_flow(
     assert findings(on_two_machines(declared=True), BOTH_BRIDGED) == []
 
 
-# --- nodes that another supervisor brings up
-
-
 # --- what a connection carries where the RMW lists no NFE of it
 
 
