@@ -62,7 +62,7 @@ _Ns = typing.Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 _Port = typing.Annotated[int, msgspec.Meta(ge=0, le=65535)]
 
 
-class Notice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class AliveNotice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What a participant says beside that it is alive.
 
     Attributes:
@@ -123,7 +123,7 @@ class AlivePublisher:
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
-    def notify(self, notice: Notice) -> None:
+    def notify(self, notice: AliveNotice) -> None:
         """Publish which of our nodes are silent, and what else there is to say; from any thread.
 
         Present and later subscribers receive it. A message may be lost for some seconds: publish
@@ -181,7 +181,7 @@ class AliveSubscription:
         *,
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_notice: Callable[[Notice, int, int], None],
+        on_notice: Callable[[AliveNotice, int, int], None],
     ) -> None:
         def changed(info: QoSLivelinessChangedInfo) -> None:
             if info.alive_count > 0:
@@ -193,7 +193,7 @@ class AliveSubscription:
 
         def received(message: String, info: Mapping[str, int]) -> None:
             try:
-                notice = from_json(message.data, Notice, longest=_LONGEST_NOTICE)
+                notice = from_json(message.data, AliveNotice, longest=_LONGEST_NOTICE)
             except ValueError as error:
                 # Any participant may write the topic, and no executor thread may end by it.
                 _logger.warning("cannot read what is silent: %s", error)

@@ -29,7 +29,7 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, Timeouts
 from lifecycle.manifest.names import node_alive_topic
-from lifecycle.middleware.discovery.liveliness import AlivePublisher, Notice
+from lifecycle.middleware.discovery.liveliness import AliveNotice, AlivePublisher
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
@@ -108,7 +108,7 @@ class OwnLiveliness:
         with self._lock:
             # Only what still holds is said again.
             if silent is self._silent and self._publisher is not None:
-                self._publisher.notify(Notice(silent=silent))
+                self._publisher.notify(AliveNotice(silent=silent))
 
 
 def run(

@@ -46,9 +46,9 @@ from lifecycle.verify.verdict import Finding, FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.middleware.discovery.liveliness import (
+        AliveNotice,
         AlivePublisher,
         AliveSubscription,
-        Notice,
         PlanNotices,
     )
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
@@ -261,7 +261,7 @@ class Peers:
             self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
         self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
 
-    def _noticed(self, peer: _Peer, notice: Notice, sent_ns: int, received_ns: int) -> None:
+    def _noticed(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
         self._compare(peer.machine, notice, sent_ns, received_ns)
         silent = notice.silent
         for name in peer.nodes:
@@ -287,9 +287,11 @@ class Peers:
             self._loop.call_later(wait_s, say)
 
     def _notify(self) -> None:
-        from lifecycle.middleware.discovery.liveliness import Notice
+        from lifecycle.middleware.discovery.liveliness import AliveNotice
 
-        notice = Notice(silent=self._silent, received=self._received, marks=self._marks.own_ports)
+        notice = AliveNotice(
+            silent=self._silent, received=self._received, marks=self._marks.own_ports
+        )
         for each in self._announcements:
             each.notify(notice)
 
@@ -308,7 +310,7 @@ class Peers:
             self._notify()
             self._exchanging = self._loop.call_later(EXCHANGED_S, self._exchange)
 
-    def _compare(self, machine: str, notice: Notice, sent_ns: int, received_ns: int) -> None:
+    def _compare(self, machine: str, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
         """It sent a notice, having received ours."""
         if not machine:
             return

@@ -23,9 +23,9 @@ from lifecycle.verify.tool_filter import known_node
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
     from lifecycle.middleware.discovery.liveliness import (
+        AliveNotice,
         AlivePublisher,
         AliveSubscription,
-        Notice,
         PlanNotices,
     )
     from lifecycle.middleware.rcl.graph import GraphObserver
@@ -120,7 +120,7 @@ class ObserverParticipant:
         *,
         on_liveliness: Callable[[bool], None],
         on_left: Callable[[], None],
-        on_notice: Callable[[Notice, int, int], None],
+        on_notice: Callable[[AliveNotice, int, int], None],
     ) -> AliveSubscription:
         """Watch the liveliness of another supervisor, or of a node that is attached."""
         from lifecycle.middleware.discovery.liveliness import AliveSubscription

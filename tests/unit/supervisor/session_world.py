@@ -28,7 +28,7 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
-from lifecycle.middleware.discovery.liveliness import Notice
+from lifecycle.middleware.discovery.liveliness import AliveNotice
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.run_directory import RunDirectory, short_path
@@ -87,7 +87,7 @@ class FakeAir:
     def announce_alive(self, topic: str) -> SimpleNamespace:
         said = self.announced.setdefault(topic, [])
 
-        def notify(notice: Notice) -> None:
+        def notify(notice: AliveNotice) -> None:
             said.append(dict(notice.silent))
             self.received.append(dict(notice.received))
 
@@ -98,9 +98,9 @@ class FakeAir:
         self.watched[topic] = SimpleNamespace(
             alive=callbacks["on_liveliness"],
             left=callbacks["on_left"],
-            silent=lambda silent: on_notice(Notice(silent=silent), 0, 0),
+            silent=lambda silent: on_notice(AliveNotice(silent=silent), 0, 0),
             times=lambda sent_ns, received_ns, theirs: on_notice(
-                Notice(silent={}, received=theirs), sent_ns, received_ns
+                AliveNotice(silent={}, received=theirs), sent_ns, received_ns
             ),
             destroy=lambda: self.watched.pop(topic),
         )
