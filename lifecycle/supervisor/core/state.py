@@ -379,7 +379,6 @@ class Change(msgspec.Struct, kw_only=True):
         back: the system goes back to the manifest before.
         state: why the gate stayed closed for the manifest before; empty if it did not.
         again: what failed meanwhile, and is started again by its policy; empty if nothing.
-        ends: what failed of others meanwhile, and ends the run.
     """
 
     plan: Plan
@@ -399,7 +398,6 @@ class Change(msgspec.Struct, kw_only=True):
     code: ExitCode = ExitCode.OK
     state: str = ""
     again: str = ""
-    ends: list[Failure] = []
 
 
 class Judged(msgspec.Struct, kw_only=True):
