@@ -604,9 +604,10 @@ class Run(msgspec.Struct, kw_only=True):
 
     @property
     def is_watched(self) -> bool:
-        """Whether it was up and some of it is active: then all that changes is looked at."""
+        """Whether it was up and is active, at least in part: then all that changes is looked at."""
         active = any(each.level is Level.ACTIVE for each in self.nodes.values())
-        return active and self.held_s is not None
+        gated = any(each.is_gated for each in self.nodes.values())
+        return self.held_s is not None and (active or not gated)
 
     def is_past(self, at_s: float) -> bool:
         """Return whether a moment is over; one that is still to come wakes the run.
