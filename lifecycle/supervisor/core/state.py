@@ -105,6 +105,20 @@ def held_level(node: PlannedNode, condition: Condition | Readiness) -> Level:
     return Level.CONFIGURED if isinstance(condition, Readiness) else HOLDS[condition]
 
 
+def limit_of(node: PlannedNode, step: Step) -> float:
+    """Return the seconds that the manifest gives a node for a step."""
+    limits = node.timeouts
+    return {
+        Step.START: limits.start_s,
+        Step.CONFIGURE: limits.configure_s,
+        Step.WIRE: limits.connect_s,
+        Step.CONNECT: limits.connect_s,
+        Step.ACTIVATE: limits.activate_s,
+        Step.DEACTIVATE: limits.deactivate_s,
+        Step.SHUTDOWN: limits.shutdown_s,
+    }.get(step, limits.cleanup_s)
+
+
 class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
