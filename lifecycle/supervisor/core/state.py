@@ -11,7 +11,7 @@ a run is here: nothing is kept in a coroutine, a timer or a callback. Pure.
 from __future__ import annotations
 
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 
 import msgspec
@@ -327,6 +327,7 @@ class Passage(msgspec.Struct, kw_only=True):
         keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
+        tries: nodes that were started again at it, by full name, and how often.
         mark: of the moment at which they had; `since_s`: when that was.
         said: it was said what the gate waits for.
         begun_s: when a verdict opened the gate; None before.
@@ -344,6 +345,7 @@ class Passage(msgspec.Struct, kw_only=True):
     keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
+    tries: Counter[str] = msgspec.field(default_factory=Counter)
     mark: int = 0
     since_s: float = NEVER_S
     said: bool = False
