@@ -139,6 +139,12 @@ class NodeRun:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
+    def where(self) -> str:
+        """Return where it is in a step that takes long, for messages; empty if not known."""
+        if self.wiring:
+            return f"its step {self.wiring}"
+        return "" if self.process is None else self.process.where()
+
     @property
     def is_to_be_given(self) -> bool:
         """Whether its command line cannot give it all of its parameters, see `command_line`."""
