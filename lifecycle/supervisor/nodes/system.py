@@ -323,17 +323,9 @@ class System:
 
     def carried_by(self, process: str) -> tuple[NodeRun, ...]:
         """Return the nodes that are gone with a process, loaded components included."""
-        run = self.run
-        return tuple(
-            node
-            for node in self.nodes.values()
-            if node.core.process == process
-            or (
-                (found := run.process_of(node.core)) is not None
-                and found.name == process
-                and node.planned.run.component
-            )
-        )
+        carrier = self.run.processes.get(process)
+        nodes = self.nodes.values() if carrier is not None else ()
+        return tuple(node for node in nodes if self.run.process_of(node.core) is carrier)
 
     def node_named(self, name: str) -> NodeRun | None:
         """Return the node with this fully qualified name."""
