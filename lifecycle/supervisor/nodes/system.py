@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RosArguments, RunKind
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
@@ -320,6 +321,22 @@ class System:
                 if planned.run.kind is RunKind.PYTHON
             ),
         )
+
+    def have_hosts(
+        self,
+        operation: Operation,
+        apart: Callable[[ManagedProcess], tuple[str, ...]] = lambda _: (),
+    ) -> None:
+        """Have our hosts do something with all of their process; nobody waits for it.
+
+        Args:
+            operation: of a whole process.
+            apart: of a process, see `Command`.
+        """
+        for each in self.processes.values():
+            if each.channel is not None and not each.ended.done():
+                node = self.nodes[each.planned.nodes[0]].name
+                each.channel.send(Command(node=node, operation=operation, apart=apart(each)))
 
     def carried_by(self, process: str) -> tuple[NodeRun, ...]:
         """Return the nodes that are gone with a process, loaded components included."""
