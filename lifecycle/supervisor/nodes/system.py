@@ -444,8 +444,11 @@ def level_of(node: NodeRun) -> Level:
     """Return how far a node is by what it said of itself; where it said nothing, what is noted."""
     if not node.planned.managed or not node.state:
         return node.core.level
-    if node.state == ACTIVE:
-        return Level.ACTIVE
-    if node.state == INACTIVE:
-        return Level.CONNECTED if node.connected else Level.CONFIGURED
-    return Level.STARTED
+    return reached(node.state, connected=node.connected)
+
+
+def reached(state: str, *, connected: bool) -> Level:
+    """Return how far a managed node is in a state, by its lifecycle_msgs/State label."""
+    if state == INACTIVE:
+        return Level.CONNECTED if connected else Level.CONFIGURED
+    return Level.ACTIVE if state == ACTIVE else Level.STARTED

@@ -15,10 +15,11 @@ from lifecycle.manifest.model import Condition
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.core import advance, effects, gate, inputs
-from lifecycle.supervisor.core.state import NEVER_S, Level
+from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
 from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.judging.judge import without
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.nodes.system import reached
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
 from lifecycle.verify.readiness import shown
 from lifecycle.verify.rules.health import health_of
@@ -255,15 +256,12 @@ def conditions(planned: PlannedNode, seen: Observation) -> frozenset[Condition]:
     if observed is None:
         return frozenset()
     report = next((each for each in seen.configurations if each.name == name), None)
-    up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
-    said = health_of(planned, own_health(report), observed.health)
-    healthy = (Condition.HEALTHY,) if said.ok else ()
     state = observed.state or (report.state if report is not None else "")
-    if not planned.managed or state == ACTIVE:
-        return frozenset((*up_to_active, *healthy))
-    if state != INACTIVE:
-        return frozenset((Condition.STARTED,))
-    # A node that is not ours makes its data layer in configure, and has no such report.
-    if report is None or report.connected:
-        return frozenset(up_to_active[:3])
-    return frozenset(up_to_active[:2])
+    level = Level.ACTIVE
+    if planned.managed:
+        # A node that is not ours makes its data layer in configure, and has no such report.
+        level = reached(state, connected=report is None or report.connected)
+    found = {condition for condition, least in HOLDS.items() if least <= level}
+    if not health_of(planned, own_health(report), observed.health).ok:
+        found.discard(Condition.HEALTHY)
+    return frozenset(found)
