@@ -312,7 +312,6 @@ class System:
             logs=self.logs,
             emit=self.emit,
             variables=self._variables,
-            nodes={each.full_name: each.key for each in nodes},
             # A host of ours deactivates its nodes and shuts them down.
             grace_s=GRACE_S
             + sum(
