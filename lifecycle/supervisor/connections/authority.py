@@ -127,9 +127,6 @@ class PlannedSource:
         return self._instructions
 
 
-_Interface = NodeDriver | NodeInterfaceClient
-
-
 class _Wiring(msgspec.Struct):
     """What the authority knows of one node that it wires.
 
@@ -147,17 +144,6 @@ class _Wiring(msgspec.Struct):
     last_s: float = float("-inf")
     error: str = ""
     given_up: str | None = None
-
-
-class _Wirable(msgspec.Struct):
-    """A node that can be wired now; `node` is None if it joined without being declared."""
-
-    interface: _Interface
-    node: NodeRun | None
-    checksum: str
-    wiring: _Wiring
-    has: Instructions
-    missing: tuple[Command, ...]
 
 
 class ConnectionAuthority:
@@ -217,7 +203,7 @@ class ConnectionAuthority:
         wiring.has = wired(configuration)
         there = dict(wiring.has.connections)
         wiring.ours = [connection for connection in wiring.ours if connection in there]
-        await self._make(wiring, node.driver, steps(wanted, wiring.has), node)
+        await self._make(node.name, steps(wanted, wiring.has))
 
     async def unwire(self, node: NodeRun) -> None:
         """Unmake what a node was connected to, the last connection first, each bounded."""
@@ -271,10 +257,8 @@ class ConnectionAuthority:
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.has, ours=wiring.ours)
-            interface = NodeInterfaceClient(self._participant.clients, name)
-            making = self._make(wiring, interface, unmade, None)
             try:
-                await asyncio.wait_for(making, RELEASE_S)
+                await asyncio.wait_for(self._make(name, unmade), RELEASE_S)
             except (BringUpError, asyncio.TimeoutError):
                 continue  # the step's own event said why; the node is not ours to wait for
 
@@ -298,7 +282,8 @@ class ConnectionAuthority:
         if not self._follows:
             return False
         return bool(self._making) or any(
-            each.missing and each.wiring.given_up != each.checksum for each in self._wirable()
+            missing and self._wiring(said.name).given_up != said.checksum
+            for said, _, missing in self._lacking()
         )
 
     def _wiring(self, name: str) -> _Wiring:
@@ -317,41 +302,37 @@ class ConnectionAuthority:
         """Make what is missing at every look."""
         while True:
             self._wake.clear()
-            waits_s = [await self._repair(each) for each in self._wirable()]
+            waits_s = [await self._repair(*each) for each in self._lacking()]
             await set_within(self._wake, min(filter(None, waits_s), default=None))
 
-    def _wirable(self) -> Iterator[_Wirable]:
-        """Yield the nodes that can be wired now, with what each lacks."""
+    def _lacking(
+        self,
+    ) -> Iterator[tuple[NodeConfiguration, Instructions, tuple[Command, ...]]]:
+        """Yield of each node that can be wired now what it says, what it has and what it lacks."""
         dead = self._system.dead()
         remote = {each.full_name for each in self._system.remote.values()}
         for name, wanted in self._instructions.items():
             node = self._system.node_named(name)
-            configuration = self._others.get(name) if node is None else node.configuration
-            if configuration is None or configuration.state not in (INACTIVE, ACTIVE):
+            said = self._others.get(name) if node is None else node.configuration
+            if said is None or said.state not in (INACTIVE, ACTIVE) or name in dead | remote:
                 continue
-            interface: _Interface
-            if node is None:
-                if name in remote:
-                    continue
-                interface = NodeInterfaceClient(self._participant.clients, name)
-            else:
-                if node.driver is None or node.core.stuck or name in dead:
-                    continue
-                if not configuration.connected or node.core.base is Level.ACTIVE:
-                    continue  # the latter is verified as it was found
-                interface = node.driver
+            if node is not None and (node.driver is None or node.core.stuck or not said.connected):
+                continue
+            if node is not None and node.core.base is Level.ACTIVE:
+                continue  # it is verified as it was found
             wiring = self._wiring(name)
-            has = wired(configuration) if self._repairs or node is None else wiring.has
-            missing = steps(wanted, has, ours=wiring.ours)
-            yield _Wirable(interface, node, configuration.checksum, wiring, has, missing)
+            has = wired(said) if self._repairs or node is None else wiring.has
+            yield said, has, steps(wanted, has, ours=wiring.ours)
 
-    async def _repair(self, one: _Wirable) -> float | None:
+    async def _repair(
+        self, said: NodeConfiguration, has: Instructions, missing: tuple[Command, ...]
+    ) -> float | None:
         """Wire a node that lacks something; return after how many seconds to try again."""
-        wiring = one.wiring
-        if not one.missing:
-            wiring.has, wiring.error = one.has, ""
+        wiring = self._wiring(said.name)
+        if not missing:
+            wiring.has, wiring.error = has, ""
             return None
-        if wiring.given_up == one.checksum:
+        if wiring.given_up == said.checksum:
             return None
         now_s = asyncio.get_running_loop().time()
         if wiring.given_up is not None or now_s - wiring.last_s > CALM_S:
@@ -359,15 +340,15 @@ class ConnectionAuthority:
         due_s = wiring.last_s + _backoff_s(wiring.rounds)
         if now_s < due_s:
             return due_s - now_s
-        self._say_lost(wiring, one.has)
+        self._say_lost(wiring, has)
         wiring.rounds += 1
-        wiring.last_s, wiring.has, wiring.error = now_s, one.has, ""
+        wiring.last_s, wiring.has, wiring.error = now_s, has, ""
         try:
-            await self._make(wiring, one.interface, one.missing, one.node)
+            await self._make(said.name, missing)
         except BringUpError as error:
             wiring.error = error.message
         if wiring.rounds >= TRIES:
-            wiring.given_up = one.checksum
+            wiring.given_up = said.checksum
             return None
         # Also after a success: one that does not show in the node's own report is none.
         return _backoff_s(wiring.rounds)
@@ -382,14 +363,11 @@ class ConnectionAuthority:
             if endpoint not in mapped and (connection in there or not connection):
                 self._system.emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
 
-    async def _make(
-        self,
-        wiring: _Wiring,
-        interface: _Interface,
-        missing: Iterable[Command],
-        node: NodeRun | None,
-    ) -> None:
-        """Make steps in order; the first that fails ends it."""
+    async def _make(self, name: str, missing: Iterable[Command]) -> None:
+        """Make steps of a node in order; the first that fails ends it."""
+        node, wiring = self._system.node_named(name), self._wiring(name)
+        interface: NodeDriver | NodeInterfaceClient | None = node.driver if node else None
+        interface = interface or NodeInterfaceClient(self._participant.clients, name)
         for step in missing:
             if node is not None:
                 node.wiring = str(step)

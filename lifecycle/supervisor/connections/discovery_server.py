@@ -24,6 +24,7 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
+from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
 
@@ -62,16 +63,14 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
         return
     if discovery_server_listens(planned):
         # Fast DDS's server goes on without the port, and its owner seems to be the server.
-        raise StepFailedError(
+        raise _failed(
             f"cannot start the discovery server at {_where(planned)}: that port is not free on "
-            "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'",
-            rule=START_FAILED,
-            subject=NAME,
+            "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'"
         )
     try:
         argv, environment = discovery_server_command(planned, {**os.environ})
     except MiddlewareError as error:
-        raise StepFailedError(error.message, rule=START_FAILED, subject=NAME) from error
+        raise _failed(error.message) from error
     # What it must not have would be inherited: `env` takes it away and becomes the program.
     without = [f"--unset={name}" for name in os.environ if name not in environment]
     argv = ("env", *without, *argv)
@@ -89,9 +88,7 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
     try:
         await process.spawn(spawner, None)
     except (BringUpError, OSError) as error:
-        raise StepFailedError(
-            f"cannot start the discovery server: {error}", rule=START_FAILED, subject=NAME
-        ) from error
+        raise _failed(f"cannot start the discovery server: {error}") from error
     _say(system, ProcessState.STARTING)
     await _until_it_listens(planned, process)
     _say(system, ProcessState.RUNNING)
@@ -154,23 +151,13 @@ async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | No
     log = "" if process is None else str(process.log.path)
     while True:
         if process is not None and process.ended.done():
-            raise StepFailedError(
-                f"cannot start the discovery server at {_where(planned)}: {process.ended.result()}",
-                rule=START_FAILED,
-                subject=NAME,
-                process=NAME,
-                log=log,
-            )
+            text = f"cannot start the discovery server at {_where(planned)}"
+            raise _failed(f"{text}: {process.ended.result()}", process=NAME, log=log)
         if (left_s := deadline - loop.time()) <= 0:
             machine = f" of machine {planned.machine!r}" if planned.machine else ""
             whose = "" if process is not None else f"{machine}, whose supervisor starts it,"
-            raise StepFailedError(
-                f"cannot reach the discovery server{whose} at {_where(planned)}: nobody listened "
-                f"for {START_S:g} s",
-                rule=DEADLINE,
-                subject=NAME,
-                log=log,
-            )
+            text = f"cannot reach the discovery server{whose} at {_where(planned)}"
+            raise _failed(f"{text}: nobody listened for {START_S:g} s", DEADLINE, log=log)
         if process is not None and discovery_server_listens(planned, process.pid):
             return
         if process is None and await _answers(planned, left_s):
@@ -190,6 +177,12 @@ async def _answers(planned: PlannedServer, timeout_s: float) -> bool:
         with contextlib.suppress(OSError):
             await writer.wait_closed()
     return True
+
+
+def _failed(
+    message: str, rule: Rule = START_FAILED, *, process: str = "", log: str = ""
+) -> StepFailedError:
+    return StepFailedError(message, rule=rule, subject=NAME, process=process, log=log)
 
 
 def _where(planned: PlannedServer) -> str:

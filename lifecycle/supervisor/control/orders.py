@@ -8,7 +8,7 @@ not import rclpy.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 from lifecycle.errors import UsageError
 from lifecycle.network.connection_url import parse
@@ -17,7 +17,7 @@ from lifecycle.plan.comparison import PlanDifference, changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core.change import change_to
-from lifecycle.supervisor.core.orders import SAID, named
+from lifecycle.supervisor.core.orders import SAID, restarted
 from lifecycle.supervisor.core.state import Order
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.options import local_processes
@@ -52,22 +52,10 @@ def check(order: Order, system: System, machine: str) -> None:
         if found and order.ask is not ControlRequest.PAUSE:
             raise _refused(order, system, found)
     elif order.ask is ControlRequest.RESTART:
-        keys = _restarted(order, system)
+        keys = restarted(system.run, order)
         found = changes(running, with_files_of_now(running))
         if found := tuple(each for each in found if each.node in keys):
             raise _refused(order, system, found)
-
-
-def _restarted(order: Order, system: System) -> Collection[str]:
-    """Return the keys of all nodes that an order restarts."""
-    if not order.node:
-        return tuple(system.nodes)
-    node = named(system.run, order.node)
-    if node is None:
-        return ()
-    # A component has none of its own: its container loads it anew.
-    process = system.run.processes.get(node.process)
-    return (node.key,) if process is None else process.planned.nodes
 
 
 def _refused(order: Order, system: System, found: Iterable[PlanDifference]) -> UsageError:

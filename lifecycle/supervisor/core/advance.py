@@ -25,6 +25,7 @@ from lifecycle.supervisor.core.state import (
     Run,
     Step,
     held_level,
+    limit_of,
 )
 from lifecycle.verify.verdict import Stage
 
@@ -293,16 +294,6 @@ def _goes_with_container(run: Run, node: Node) -> bool:
 
 
 def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
-    limits = node.planned.timeouts
-    limit_s = {
-        Step.START: limits.start_s,
-        Step.CONFIGURE: limits.configure_s,
-        Step.WIRE: limits.connect_s,
-        Step.CONNECT: limits.connect_s,
-        Step.ACTIVATE: limits.activate_s,
-        Step.DEACTIVATE: limits.deactivate_s,
-        Step.SHUTDOWN: limits.shutdown_s,
-    }.get(step, limits.cleanup_s)
     appears = step is Step.START and only_appears(node) and not node.planned.holds
     theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
@@ -310,7 +301,7 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
         number=run.requests,
         step=step,
         since_s=run.now_s,
-        limit_s=NEVER_S if appears else limit_s,
+        limit_s=NEVER_S if appears else limit_of(node.planned, step),
         own_s=OWN_S if theirs else 0.0,
     )
     if step is not Step.ACTIVATE:

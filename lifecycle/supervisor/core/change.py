@@ -250,8 +250,6 @@ def _finish(run: Run, change: Change) -> list[Event]:
     events = [_said(run, "rolled_back", change.reason), Notice(message=text)]
     run.change = None
     run.answer(change.code, text)
-    if change.ends:
-        run.fails_now(*change.ends)
     return events
 
 
@@ -259,8 +257,8 @@ def undone(run: Run, change: Change) -> str:
     """Say what became of a manifest that could not be applied, and what the system is now."""
     before = change.before.manifest_path
     text = f"cannot apply {change.plan.manifest_path}: {change.reason}\n"
-    if ends := [*change.ends, *run.failures]:
-        why = "; ".join(each.message for each in ends)
+    if run.failures:
+        why = "; ".join(each.message for each in run.failures)
         return f"{text}cannot go back to {before}: {why}; the system is taken down"
     now = rests_as(run)
     how = f"{now} and verified"

@@ -21,6 +21,7 @@ from lifecycle.supervisor.core.restart import is_restarted
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
+    Change,
     Ending,
     Level,
     Node,
@@ -193,7 +194,10 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
     run.changed()
     change = run.change
     if change is not None and not change.back:
-        return _fails_in_change(run, failure, end)
+        events = go_back(run, failure.message, ExitCode.BRING_UP_FAILED)
+        if _is_of_change(run, change, failure, end):
+            return events
+        return [*events, *fail(run, failure, end)]  # what fails of others counts as ever
     if process is not None and process.failed:
         return []  # it is to be started again for another failure already
     if _is_covered(process, end):
@@ -220,27 +224,17 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
     return []
 
 
-def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Event]:
-    """Have the system go back; what failed of others counts as ever."""
-    change, process = run.change, run.processes.get(failure.process)
-    assert change is not None
+def _is_of_change(run: Run, change: Change, failure: Failure, end: Exited | None) -> bool:
+    """Return whether the way back mends a failure: of what it takes down, or of what still runs."""
     node = run.node_named(failure.subject)
-    keys = {each.key for each in run.nodes_of(process.name)} if process is not None else set()
+    keys = {each.key for each in run.nodes_of(failure.process)} if failure.process else set()
     keys |= set() if node is None else {node.key}
-    touched = bool(keys & (change.touched | change.down))
     died = end is not None or failure.rule == PROCESS_DIED.id
-    events = go_back(run, failure.message, ExitCode.BRING_UP_FAILED)
-    if touched or not died:
-        change.down |= keys
-        change.touched |= keys
-    elif _is_covered(process, end) and process is not None:
-        change.again = failure.message
-        events += _back_off(run, process, failure, end)
-    else:
-        change.ends = [*change.ends, failure]
-        if process is not None:
-            process.stays_down = True
-    return events
+    if died and keys.isdisjoint(change.touched | change.down):
+        return False
+    change.down |= keys
+    change.touched |= keys
+    return True
 
 
 def _is_covered(process: Process | None, end: Exited | None) -> bool:

@@ -120,7 +120,6 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
         mark: of the moment at which it began.
         again_s: look again after so long, as nobody says when what is missing is there.
         waits: something is awaited that may speak against it: it opens nothing.
-        undiscovered: key of a node that others do not discover over TCP although it runs.
         away: full names of the nodes that were not as far as they are to be when it began.
     """
 
@@ -128,7 +127,6 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Verdict
     again_s: float = float("inf")
     waits: bool = False
-    undiscovered: str = ""
     away: frozenset[str] = frozenset()
 
 

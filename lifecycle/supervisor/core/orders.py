@@ -174,15 +174,19 @@ def _begin(run: Run, order: Order) -> list[Event]:
     return []
 
 
+def restarted(run: Run, order: Order) -> set[str]:
+    """Return the keys of the nodes that an order restarts: of all that comes and goes with one."""
+    if not order.node:
+        return set(run.nodes)
+    node = named(run, order.node)
+    keys = set() if node is None else set(run.whole({node.key}))
+    return keys | _gone_with(run, keys)
+
+
 def _restart(run: Run, order: Order) -> None:
-    """Have nodes go down once, with all that comes and goes with them; failures are forgotten."""
-    node = named(run, order.node) if order.node else None
-    keys = set(run.nodes)
-    names = {each.process for each in run.nodes.values()}
-    if node is not None:
-        keys = set(run.whole({node.key}))
-        keys |= _gone_with(run, keys)
-        names = {run.nodes[key].process for key in keys}
+    """Have nodes go down once; failures are forgotten."""
+    keys = restarted(run, order)
+    names = {run.nodes[key].process for key in keys}
     run.deaths = [each for each in run.deaths if each.process not in names]
     for key in keys:
         each = run.nodes[key]

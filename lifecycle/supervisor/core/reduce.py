@@ -22,6 +22,7 @@ from lifecycle.supervisor.core.change import (
     settle_change,
     settle_mode,
 )
+from lifecycle.supervisor.core.first_contact import settle_first_contact
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -71,6 +72,7 @@ def _settle(run: Run) -> list[Event]:
         events += settle_mode(run)
         events += settle_change(run)
         events += passing.settle(run)
+        events += settle_first_contact(run)
         events += orders.settle_orders(run)
         events += consequences.settle_consequences(run)
         events += _hold(run)
@@ -298,10 +300,6 @@ def _refused(run: Run, given: inputs.Refused) -> list[Event]:
 
 def _verified(run: Run, given: inputs.Verified) -> list[Event]:
     verdict, stage = gate.take_verdict(run, given), advance.stage_of(run)
-    node = run.nodes.get(given.undiscovered)
-    if node is not None and run.opening is None:
-        for each in run.nodes_of(node.process):
-            each.renew = True
     if verdict is None:
         return []
     return [VerdictChanged(stage=stage, verdict=verdict)]

@@ -11,7 +11,7 @@ a run is here: nothing is kept in a coroutine, a timer or a callback. Pure.
 from __future__ import annotations
 
 import enum
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 
 import msgspec
@@ -103,6 +103,20 @@ def held_level(node: PlannedNode, condition: Condition | Readiness) -> Level:
     if not node.managed:
         return Level.STARTED
     return Level.CONFIGURED if isinstance(condition, Readiness) else HOLDS[condition]
+
+
+def limit_of(node: PlannedNode, step: Step) -> float:
+    """Return the seconds that the manifest gives a node for a step."""
+    limits = node.timeouts
+    return {
+        Step.START: limits.start_s,
+        Step.CONFIGURE: limits.configure_s,
+        Step.WIRE: limits.connect_s,
+        Step.CONNECT: limits.connect_s,
+        Step.ACTIVATE: limits.activate_s,
+        Step.DEACTIVATE: limits.deactivate_s,
+        Step.SHUTDOWN: limits.shutdown_s,
+    }.get(step, limits.cleanup_s)
 
 
 class Request(msgspec.Struct, kw_only=True):
@@ -313,6 +327,7 @@ class Passage(msgspec.Struct, kw_only=True):
         keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
+        tries: nodes that were started again at it, by full name, and how often.
         mark: of the moment at which they had; `since_s`: when that was.
         said: it was said what the gate waits for.
         begun_s: when a verdict opened the gate; None before.
@@ -330,6 +345,7 @@ class Passage(msgspec.Struct, kw_only=True):
     keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
+    tries: Counter[str] = msgspec.field(default_factory=Counter)
     mark: int = 0
     since_s: float = NEVER_S
     said: bool = False
@@ -379,7 +395,6 @@ class Change(msgspec.Struct, kw_only=True):
         back: the system goes back to the manifest before.
         state: why the gate stayed closed for the manifest before; empty if it did not.
         again: what failed meanwhile, and is started again by its policy; empty if nothing.
-        ends: what failed of others meanwhile, and ends the run.
     """
 
     plan: Plan
@@ -399,7 +414,6 @@ class Change(msgspec.Struct, kw_only=True):
     code: ExitCode = ExitCode.OK
     state: str = ""
     again: str = ""
-    ends: list[Failure] = []
 
 
 class Judged(msgspec.Struct, kw_only=True):
@@ -606,9 +620,10 @@ class Run(msgspec.Struct, kw_only=True):
 
     @property
     def is_watched(self) -> bool:
-        """Whether it was up and some of it is active: then all that changes is looked at."""
+        """Whether it was up and is active, at least in part: then all that changes is looked at."""
         active = any(each.level is Level.ACTIVE for each in self.nodes.values())
-        return active and self.held_s is not None
+        gated = any(each.is_gated for each in self.nodes.values())
+        return self.held_s is not None and (active or not gated)
 
     def is_past(self, at_s: float) -> bool:
         """Return whether a moment is over; one that is still to come wakes the run.

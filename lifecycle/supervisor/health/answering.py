@@ -8,11 +8,9 @@ asking, see liveliness.py. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -51,33 +49,26 @@ class Answering:
         self._system = system
         self._clients = clients
         self._said: set[str] = set()
-        self._known_s: dict[str, float] = {}  # when it was known last of a node how it is
-        self._known = asyncio.Event()
-        self._hurry = asyncio.Event()
+        self._known_s: dict[NodeRun, float] = {}  # when it was known last of a node how it is
+        self._tasks: dict[NodeRun, asyncio.Task[None]] = {}
 
     async def follow(self) -> None:
         """Ask, until this is cancelled. A node that is down or stopped is not asked."""
-        tasks: dict[str, tuple[NodeRun, asyncio.Task[None]]] = {}
+        liveliness = self._system.liveliness
         try:
             while True:
-                self._hurry.clear()
-                now = {each.name: each for each in self._system.nodes.values() if _is_asked(each)}
-                for name, (node, task) in tuple(tasks.items()):
-                    if now.get(name) is not node or task.done():
-                        await ended(task)
-                        del tasks[name]
-                        self._known_s.pop(name, None)
-                        if not node.doing:
-                            self._system.liveliness.answered(name)
-                new = [each for name, each in now.items() if name not in tasks]
-                for index, node in enumerate(new):
-                    # Side by side at first, and then in turns.
-                    again_s = EVERY_S * (index + 1) / (len(new) + 1)
-                    task = asyncio.ensure_future(self._follow(node, again_s))
-                    tasks[node.name] = node, task
-                await set_within(self._hurry, EVERY_S / 4)
+                nodes = self._reachable()
+                for node in [each for each in self._tasks if each not in nodes]:
+                    await ended(self._tasks.pop(node))
+                    self._known_s.pop(node, None)
+                    if not (node.doing or liveliness.is_out_of_reach(node.name)):
+                        liveliness.answered(node.name)
+                for node in nodes:
+                    if self._age_s(node) >= EVERY_S:
+                        self._begin(node)
+                await asyncio.sleep(EVERY_S / 4)
         finally:
-            await ended(*(task for _, task in tasks.values()))
+            await ended(*self._tasks.values())
 
     async def asked(self, timeout_s: float) -> bool:
         """Wait, bounded, until it is known of each node that is there whether it answers.
@@ -88,80 +79,60 @@ class Answering:
         Returns:
             Whether any had to be waited for: what was seen before is older than the answers.
         """
-        loop = asyncio.get_running_loop()
-        began_s = loop.time()
+        loop, liveliness = asyncio.get_running_loop(), self._system.liveliness
         limit_s = max(_LEAST_S, min(timeout_s, _GATE_S))
+        until_s = loop.time() + limit_s
         waited = False
-        while unknown := tuple(self._unknown()):
+        while tasks := {
+            self._begin(each): each
+            for each in self._reachable()
+            if each.name not in liveliness.unanswering and self._age_s(each) > _LATELY_S
+        }:
             waited = True
-            left_s = began_s + limit_s - loop.time()
-            if left_s <= 0:
-                for each in unknown:
-                    self._system.liveliness.unanswered(each.name, limit_s)
-                break
-            self._known.clear()
-            self._hurry.set()
-            await set_within(self._known, min(left_s, _LOOK_S))
+            _, late = await asyncio.wait(tasks, timeout=max(0.0, until_s - loop.time()))
+            for each in late:
+                liveliness.unanswered(tasks[each].name, limit_s)
         return waited
 
-    def _unknown(self) -> Iterator[NodeRun]:
-        """Yield the nodes of which it is not known how they are, and which are to be asked."""
-        now_s = asyncio.get_running_loop().time()
+    def _reachable(self) -> list[NodeRun]:
+        """Return the nodes that can be asked now, and are in no host of ours."""
         present, liveliness = self._system.present, self._system.liveliness
-        for each in self._system.nodes.values():
-            if each.is_hosted or each.is_gone or not _is_tried(each):
-                continue
-            if each.doing and each.core.level is not Level.DOWN:
-                continue  # it answers after its transition
-            if present is not None and each.name not in present:
-                continue
-            if liveliness.is_out_of_reach(each.name) or each.name in liveliness.unanswering:
-                continue
-            known_s = self._known_s.get(each.name)
-            if known_s is None or now_s - known_s > _LATELY_S:
-                yield each
+        return [
+            each
+            for each in self._system.nodes.values()
+            if _is_up(each)
+            and (present is None or each.name in present)
+            and not liveliness.is_out_of_reach(each.name)
+        ]
 
-    async def _follow(self, node: NodeRun, again_s: float) -> None:
-        liveliness = self._system.liveliness
-        loop = asyncio.get_running_loop()
-        unanswered, shown_s, wait_s = 0, loop.time() + SHOWN_S, 0.0
-        has_answered = False
-        while True:
-            await asyncio.sleep(wait_s)
-            wait_s = EVERY_S
-            if self._system.present is not None and node.name not in self._system.present:
-                unanswered, shown_s = 0, loop.time() + SHOWN_S
-                liveliness.answered(node.name)
-                wait_s = EVERY_S if has_answered else _LOOK_S
-                continue
-            if liveliness.is_out_of_reach(node.name):
-                continue
-            answers = await self._ask(node, repeat=not has_answered)
-            if answers is None:
-                unanswered = 0
-                liveliness.answered(node.name)
-                if loop.time() < shown_s and not self._serves_nothing(node):
-                    wait_s = _LOOK_S
-                    continue
-                self._know(node)
-                self._say_that_it_serves_nothing(node)
-            elif answers:
-                unanswered = 0
-                if not has_answered:
-                    has_answered, wait_s = True, again_s
-                liveliness.answered(node.name)
-                self._know(node)
-            else:
-                unanswered += 1
-                wait_s = 0.0
-                if unanswered >= TRIES:
-                    liveliness.unanswered(node.name, TRIES * ANSWER_S)
-                    self._know(node)
-                    wait_s = EVERY_S / 4
+    def _age_s(self, node: NodeRun) -> float:
+        """Return since how long ago it is known how a node is; infinity if it is not."""
+        return asyncio.get_running_loop().time() - self._known_s.get(node, float("-inf"))
 
-    def _know(self, node: NodeRun) -> None:
-        self._known_s[node.name] = asyncio.get_running_loop().time()
-        self._known.set()
+    def _begin(self, node: NodeRun) -> asyncio.Task[None]:
+        """Have a node asked, by one request at a time."""
+        task = self._tasks.get(node)
+        if task is None or task.done():
+            task = self._tasks[node] = asyncio.ensure_future(self._ask(node))
+        return task
+
+    async def _ask(self, node: NodeRun) -> None:
+        """Learn whether a node answers; one that shows no service may do so in a moment."""
+        loop, liveliness = asyncio.get_running_loop(), self._system.liveliness
+        is_new, shown_s = node not in self._known_s, loop.time() + SHOWN_S
+        for _ in range(TRIES):
+            while (answers := await self._answers(node, repeat=is_new)) is None:
+                liveliness.answered(node.name)
+                if not is_new or loop.time() >= shown_s or self._serves_nothing(node):
+                    self._say_that_it_serves_nothing(node)
+                    break
+                await asyncio.sleep(_LOOK_S)
+            if answers is not False:
+                liveliness.answered(node.name)
+                break
+        else:
+            liveliness.unanswered(node.name, TRIES * ANSWER_S)
+        self._known_s[node] = loop.time()
 
     def _say_that_it_serves_nothing(self, node: NodeRun) -> None:
         if node.name not in self._said:
@@ -175,7 +146,7 @@ class Answering:
         serves = self._clients.serves_parameters(node.name)
         return not node.planned.managed and serves is False
 
-    async def _ask(self, node: NodeRun, *, repeat: bool) -> bool | None:
+    async def _answers(self, node: NodeRun, *, repeat: bool) -> bool | None:
         try:
             return await self._clients.answers(
                 node.name, managed=node.planned.managed, timeout_s=ANSWER_S, repeat=repeat
@@ -184,13 +155,12 @@ class Answering:
             return None
 
 
-def _is_tried(node: NodeRun) -> bool:
-    """Whether a node is up, or may be there unseen: a command says nothing of itself."""
+def _is_up(node: NodeRun) -> bool:
+    """Whether a node in no host of ours is up, or may be there unseen; one in a step is not."""
+    if node.is_hosted or node.is_gone:
+        return False
+    if node.core.level is not Level.DOWN:
+        return not node.doing
+    # A command says nothing of itself.
     command = node.planned.run.kind is RunKind.COMMAND and not node.planned.managed
-    process = node.process
-    return node.is_up or (command and process is not None and process.pid != 0)
-
-
-def _is_asked(node: NodeRun) -> bool:
-    """Whether a node is up, and in no host of ours; one in a transition answers after it."""
-    return not node.is_hosted and node.core.level is not Level.DOWN and not node.doing
+    return command and node.process is not None and node.process.pid != 0

@@ -13,8 +13,8 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
@@ -23,7 +23,7 @@ from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.middleware.process.control import machine_id
-from lifecycle.node.host.control import Command, Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.comparison import (
     PlanNotice,
     PlanNoticeError,
@@ -36,7 +36,6 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.health.marks import Marks, carries_marks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import MachineConnection
-from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify.observation import ArrivedMark, Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.measured import compares_clocks
@@ -121,7 +120,6 @@ class Peers:
         self._known: list[PlanNotice] = []
         self._since: dict[str, float] = {}
         self._again: asyncio.TimerHandle | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def open(self) -> None:
         """Begin to watch, and announce ourselves and our plan where another supervisor may be."""
@@ -184,7 +182,6 @@ class Peers:
             self._notices.destroy()
             self._notices = None
         self._marks.close()
-        await ended(*self._tasks)
         for peer in (*self._supervisors, *self._attached.values()):
             _forget(peer)
         for announcement in self._announcements:
@@ -236,7 +233,7 @@ class Peers:
         detail = f"{peer.what} is not heard any more"
         self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
         self._participant.send_again_soon()
-        self._have_hosts(Operation.SEND_AGAIN_SOON)
+        self._system.have_hosts(Operation.SEND_AGAIN_SOON)
 
     def _found(self, peer: _Peer) -> None:
         lost_s = 0.0
@@ -244,7 +241,7 @@ class Peers:
             lost_s = self._loop.time() - peer.lost_at_s
             # DDS may have forgotten the node names of participants that it lost for long.
             self._participant.republish_names()
-            self._have_hosts(Operation.REPUBLISH_NAMES)
+            self._system.have_hosts(Operation.REPUBLISH_NAMES)
         peer.lost_at_s = None
         if peer.machine:
             self._system.emit(
@@ -336,18 +333,6 @@ class Peers:
         now_ns = time.time_ns()
         found = ((machine, each.offset(now_ns)) for machine, each in self._clocks.items())
         return tuple((machine, offset) for machine, offset in found if offset is not None)
-
-    def _have_hosts(self, operation: Operation) -> None:
-        """Have our hosts do something with all of their process; one that hangs holds up none."""
-        for each in self._system.processes.values():
-            if each.channel is not None and not each.ended.done():
-                node = self._system.nodes[each.planned.nodes[0]].name
-                self._start(each.channel.have(Command(node=node, operation=operation)))
-
-    def _start(self, doing: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.ensure_future(doing)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
     # Who planned what, and who was shut down
 

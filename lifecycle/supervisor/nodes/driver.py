@@ -16,6 +16,7 @@ import msgspec
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import PlannedNode
+from lifecycle.supervisor.core.state import Step, limit_of
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -172,12 +173,12 @@ class ServiceDriver(NodeInterfaceClient):
 
     def __init__(self, services: NodeClients, node: PlannedNode) -> None:
         super().__init__(services, node.full_name, node.timeouts.connect_s)
-        self._timeouts = node.timeouts
+        self._planned = node
 
     async def start(self) -> NodeCondition:
         """Wait until the services answer."""
         with _failed_steps():
-            return _standing(await self._settled(self._timeouts.start_s))
+            return _standing(await self._settled(self._planned.timeouts.start_s))
 
     async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Change the state unless the node is there already."""
@@ -193,7 +194,7 @@ class ServiceDriver(NodeInterfaceClient):
             await asyncio.sleep(_PASSING_S)
 
     async def _perform(self, operation: Operation, permit: Permit | None) -> NodeCondition:
-        limit_s = self._limit_s(operation)
+        limit_s = limit_of(self._planned, Step(operation.value))
         state = await self._settled(limit_s)
         if operation in _NESTED:
             offered = await self._services.get_available_transitions(self._node, timeout_s=limit_s)
@@ -245,16 +246,6 @@ class ServiceDriver(NodeInterfaceClient):
             timeout_s=limit_s,
             before=permit if activates else None,
         )
-
-    def _limit_s(self, operation: Operation) -> float:
-        limits = self._timeouts
-        return {
-            Operation.CONFIGURE: limits.configure_s,
-            Operation.CONNECT: limits.connect_s,
-            Operation.ACTIVATE: limits.activate_s,
-            Operation.DEACTIVATE: limits.deactivate_s,
-            Operation.SHUTDOWN: limits.shutdown_s,
-        }.get(operation, limits.cleanup_s)
 
 
 NodeDriver = ControlDriver | ServiceDriver

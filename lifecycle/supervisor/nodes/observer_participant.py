@@ -1,34 +1,40 @@
 """The supervisor's participant: it observes the graph, and other supervisors see it.
 
-Owns: one `lifecycle.graph.Graph` and what else is on its participant; rclpy is imported here, late,
-and nowhere else in this room.
+Owns: one `lifecycle.graph.Graph` and what else is on its participant. It imports rclpy: elsewhere
+in this room it is imported late, where a participant is made.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
+import rclpy
+
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph.graph import Graph
 from lifecycle.graph.loop import set_within
+from lifecycle.middleware.discovery import tcp
+from lifecycle.middleware.discovery.liveliness import (
+    AlivePublisher,
+    AliveSubscription,
+    PlanNotices,
+)
+from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
+from lifecycle.middleware.fastdds.unsupported import unknown_versions
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.hidden_node import republish_names
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import known_node
 
 if TYPE_CHECKING:
-    from lifecycle.graph.graph import Graph
-    from lifecycle.middleware.discovery.liveliness import (
-        AliveNotice,
-        AlivePublisher,
-        AliveSubscription,
-        PlanNotices,
-    )
-    from lifecycle.middleware.rcl.graph import GraphObserver
     from lifecycle.middleware.services.ros_interface import RosInterface
 
 
@@ -39,13 +45,31 @@ class ObserverParticipant:
         graph: what is observed.
         discovery: what its participant discovers.
         clients: of other nodes' services.
+        rmw: name of the RMW implementation.
+        unknown_versions: which installed libraries are not known, and what that costs; empty if
+            all are.
+        announce_alive: asserts by DDS liveliness that we live.
+        watch_alive: watches the liveliness of another supervisor, or of a node that is attached.
+        plan_notices: takes part in the exchange of plans.
+        republish_names: announces our node to the graph again.
+        send_again_soon: has what waits for a link to come back be sent soon when it does.
+        prepare_to_leave: lets go of connections that do not answer: all that is sent would wait
+            for their ends.
     """
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.discovery = graph.discovery
         self.clients = graph.clients
-        self._node = graph.discovery.node
+        self.rmw = str(rclpy.get_rmw_implementation_identifier())
+        self.unknown_versions = unknown_versions()
+        self._node = node = graph.discovery.node
+        self.announce_alive = functools.partial(AlivePublisher, node)
+        self.watch_alive = functools.partial(AliveSubscription, node)
+        self.plan_notices = functools.partial(PlanNotices, node)
+        self.republish_names = functools.partial(republish_names, [node])
+        self.send_again_soon = tcp.send_again_soon
+        self.prepare_to_leave = tcp.give_up_dead_connections
 
     @classmethod
     def open(
@@ -69,28 +93,11 @@ class ObserverParticipant:
         Raises:
             MiddlewareError: it cannot be made.
         """
-        from lifecycle.graph.graph import Graph
-        from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
-
         graph = Graph.in_loop(domain_id, connections, messages=events, unplanned=unplanned)
         widen_discovery_buffers(domain_id)
         if settle_s is not None:
             graph.discovery.settling.within(settle_s)
         return cls(graph)
-
-    @property
-    def rmw(self) -> str:
-        """Name of the RMW implementation."""
-        import rclpy
-
-        return str(rclpy.get_rmw_implementation_identifier())
-
-    @property
-    def unknown_versions(self) -> str:
-        """Which installed libraries are not known, and what that costs; empty if all are."""
-        from lifecycle.middleware.fastdds.unsupported import unknown_versions
-
-        return unknown_versions()
 
     async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
@@ -107,37 +114,6 @@ class ObserverParticipant:
             name: {each.process_id: shlex.join(each.argv) for each in programs.values()}
             for name, programs in self.discovery.programs(os.environ).items()
         }
-
-    def announce_alive(self, topic: str) -> AlivePublisher:
-        """Assert by DDS liveliness that we live."""
-        from lifecycle.middleware.discovery.liveliness import AlivePublisher
-
-        return AlivePublisher(self._node, topic)
-
-    def watch_alive(
-        self,
-        topic: str,
-        *,
-        on_liveliness: Callable[[bool], None],
-        on_left: Callable[[], None],
-        on_notice: Callable[[AliveNotice, int, int], None],
-    ) -> AliveSubscription:
-        """Watch the liveliness of another supervisor, or of a node that is attached."""
-        from lifecycle.middleware.discovery.liveliness import AliveSubscription
-
-        return AliveSubscription(
-            self._node,
-            topic,
-            on_liveliness=on_liveliness,
-            on_left=on_left,
-            on_notice=on_notice,
-        )
-
-    def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
-        """Take part in the exchange of plans."""
-        from lifecycle.middleware.discovery.liveliness import PlanNotices
-
-        return PlanNotices(self._node, on_notice)
 
     def ros_interface(
         self,
@@ -158,24 +134,6 @@ class ObserverParticipant:
             return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
         except Exception as error:  # rclpy has no root of its own errors
             raise MiddlewareError(" ".join(str(error).split())) from error
-
-    def send_again_soon(self) -> None:
-        """Have what waits for a link to come back be sent soon when it does."""
-        from lifecycle.middleware.discovery.tcp import send_again_soon
-
-        send_again_soon()
-
-    def republish_names(self) -> None:
-        """Announce our node to the graph again."""
-        from lifecycle.middleware.rcl.hidden_node import republish_names
-
-        republish_names([self._node])
-
-    def prepare_to_leave(self) -> None:
-        """Let go of connections that do not answer: all that is sent would wait for their ends."""
-        from lifecycle.middleware.discovery.tcp import give_up_dead_connections
-
-        give_up_dead_connections()
 
     def destroy(self) -> None:
         """Leave the graph."""

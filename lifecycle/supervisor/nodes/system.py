@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RosArguments, RunKind
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
@@ -138,6 +139,12 @@ class NodeRun:
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
+
+    def where(self) -> str:
+        """Return where it is in a step that takes long, for messages; empty if not known."""
+        if self.wiring:
+            return f"its step {self.wiring}"
+        return "" if self.process is None else self.process.where()
 
     @property
     def is_to_be_given(self) -> bool:
@@ -305,7 +312,6 @@ class System:
             logs=self.logs,
             emit=self.emit,
             variables=self._variables,
-            nodes={each.full_name: each.key for each in nodes},
             # A host of ours deactivates its nodes and shuts them down.
             grace_s=GRACE_S
             + sum(
@@ -315,19 +321,27 @@ class System:
             ),
         )
 
+    def have_hosts(
+        self,
+        operation: Operation,
+        apart: Callable[[ManagedProcess], tuple[str, ...]] = lambda _: (),
+    ) -> None:
+        """Have our hosts do something with all of their process; nobody waits for it.
+
+        Args:
+            operation: of a whole process.
+            apart: of a process, see `Command`.
+        """
+        for each in self.processes.values():
+            if each.channel is not None and not each.ended.done():
+                node = self.nodes[each.planned.nodes[0]].name
+                each.channel.send(Command(node=node, operation=operation, apart=apart(each)))
+
     def carried_by(self, process: str) -> tuple[NodeRun, ...]:
         """Return the nodes that are gone with a process, loaded components included."""
-        run = self.run
-        return tuple(
-            node
-            for node in self.nodes.values()
-            if node.core.process == process
-            or (
-                (found := run.process_of(node.core)) is not None
-                and found.name == process
-                and node.planned.run.component
-            )
-        )
+        carrier = self.run.processes.get(process)
+        nodes = self.nodes.values() if carrier is not None else ()
+        return tuple(node for node in nodes if self.run.process_of(node.core) is carrier)
 
     def node_named(self, name: str) -> NodeRun | None:
         """Return the node with this fully qualified name."""
@@ -429,8 +443,11 @@ def level_of(node: NodeRun) -> Level:
     """Return how far a node is by what it said of itself; where it said nothing, what is noted."""
     if not node.planned.managed or not node.state:
         return node.core.level
-    if node.state == ACTIVE:
-        return Level.ACTIVE
-    if node.state == INACTIVE:
-        return Level.CONNECTED if node.connected else Level.CONFIGURED
-    return Level.STARTED
+    return reached(node.state, connected=node.connected)
+
+
+def reached(state: str, *, connected: bool) -> Level:
+    """Return how far a managed node is in a state, by its lifecycle_msgs/State label."""
+    if state == INACTIVE:
+        return Level.CONNECTED if connected else Level.CONFIGURED
+    return Level.ACTIVE if state == ACTIVE else Level.STARTED

@@ -125,24 +125,24 @@ class ControlChannel:
             if permit is None:
                 raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
             await permit()
-        if self._writer is None or self._task is None or self._task.done():
+        if (number := self.send(command)) is None:
             raise ChannelClosedError(
                 f"cannot reach {node!r}: its process closed the control channel"
             )
-        self._next += 1
-        number = self._next
         reply: asyncio.Future[Event] = asyncio.get_running_loop().create_future()
         self._replies[number] = reply
-        self._writer.write(to_json(replace(command, id=number)) + b"\n")
         try:
             return await reply
         finally:
             self._replies.pop(number, None)
 
-    async def have(self, command: Command) -> None:
-        """Have the host do something; one that ends meanwhile has nothing to do any more."""
-        with contextlib.suppress(BringUpError):
-            await self.request(command)
+    def send(self, command: Command) -> int | None:
+        """Send a command, and return the number of its reply; None to a host that has ended."""
+        if self._writer is None or self._task is None or self._task.done():
+            return None
+        self._next += 1
+        self._writer.write(to_json(replace(command, id=self._next)) + b"\n")
+        return self._next
 
     async def drained(self, timeout_s: float) -> None:
         """Wait, bounded, for what a host that has ended wrote before."""

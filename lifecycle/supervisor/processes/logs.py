@@ -15,7 +15,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lifecycle.errors import UsageError
@@ -429,24 +429,6 @@ class ProcessLog:
         """Close the file."""
         self._open = False
         self._file.close()
-
-
-_RCL_LINE = re.compile(r"(?:\x1b\[[\d;]*m)*\[[A-Z]+\] \[[\d.]+\] \[([^\]]+)\]: ")
-"""How rcutils writes a line of a logger, unless RCUTILS_CONSOLE_OUTPUT_FORMAT says otherwise."""
-
-
-def logger_of(node: str) -> str:
-    """Return the name of a node's logger: `/robot/camera` logs as `robot.camera`."""
-    return node.strip("/").replace("/", ".")
-
-
-def logger_in(line: str, loggers: Collection[str]) -> str:
-    """Return which of these loggers, or of their children, wrote a line; empty if none did."""
-    found = _RCL_LINE.match(line)
-    name = found[1] if found else ""
-    while name and name not in loggers:
-        name = name.rpartition(".")[0]
-    return name
 
 
 def _missing(lines: int) -> str:

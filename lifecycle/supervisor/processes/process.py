@@ -12,7 +12,7 @@ import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,8 +29,6 @@ from lifecycle.supervisor.processes.logs import (
     LogDirectory,
     ProcessLog,
     Traceback,
-    logger_in,
-    logger_of,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
 
@@ -96,8 +94,6 @@ class ManagedProcess:
     """An operating system process of the plan.
 
     Args:
-        nodes: keys of its nodes by their full names; of several, each has a log file of its own
-            beside the process's, with the lines of its logger.
         variables: (name, value) that it gets beside its own.
         grace_s: seconds that it gets to end by itself should the supervisor be killed.
 
@@ -121,7 +117,6 @@ class ManagedProcess:
         logs: LogDirectory,
         emit: Emitter,
         variables: tuple[tuple[str, str], ...] = (),
-        nodes: Mapping[str, str] | None = None,
         grace_s: float = GRACE_S,
     ) -> None:
         self.planned = planned
@@ -137,13 +132,6 @@ class ManagedProcess:
         self.on_stop: Callable[[bool], None] = lambda _: None
         kept = planned.run.output is not Output.SCREEN
         self.log = ProcessLog(logs, planned.name, kept=kept)
-        self._node_logs: dict[str, ProcessLog] = {}
-        if kept and nodes is not None and len(nodes) > 1:
-            self._node_logs = {
-                logger_of(name): ProcessLog(logs, key)
-                for name, key in nodes.items()
-                if key != planned.name
-            }
         self._emit = emit
         self._readers: list[LineReader] = []
 
@@ -175,8 +163,7 @@ class ManagedProcess:
             BringUpError: it cannot be started.
             OSError: the system is out of descriptors.
         """
-        for log in (self.log, *self._node_logs.values()):
-            log.open()
+        self.log.open()
         ends: list[int] = []
         control = None
         try:
@@ -232,16 +219,13 @@ class ManagedProcess:
             await self.channel.close()
         for reader in self._readers:
             reader.close()
-        for log in (self.log, *self._node_logs.values()):
-            log.close()
+        self.log.close()
 
     def _line(self, stream: str, line: str) -> None:
         self.log.add(line)
         if stream == "stderr" and line.strip():
             self.last_stderr = line
             self._traceback.add(line)
-        if self._node_logs and (logger := logger_in(line, self._node_logs)):
-            self._node_logs[logger].add(line)
         if self.planned.run.output is not Output.LOG:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
 

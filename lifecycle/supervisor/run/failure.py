@@ -1,4 +1,4 @@
-"""A failed step of bring-up as a finding; tasks that end when they are to.
+"""A failed step of bring-up as a finding; how a run ended; tasks that end when they are to.
 
 Owns: `StepFailedError`, how failures join a verdict, so that every run ends in one verdict that
 names each cause once; `ended`, `within`; and `Worker`, a thread for what blocks.
@@ -9,18 +9,22 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Collection, Coroutine, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.middleware.process.control import no_room_for_threads
+from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import Rule, rule
-from lifecycle.verify.rules.run import node_of
+from lifecycle.verify.rules.run import GAVE_UP, PROCESS_DIED, node_of
 from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.system import System
 
 
 class StepFailedError(BringUpError):
@@ -89,6 +93,37 @@ def with_failures(
         and (rule(each.rule).about is None or set(gone).isdisjoint((each.subject, *each.nodes)))
     )
     return replace(verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest))
+
+
+def result_of(system: System, latest: Verdict) -> UpResult:
+    """Return the result of a run that is over.
+
+    Args:
+        system: what ran.
+        latest: the verdict by which it began to end.
+    """
+    run = system.run
+    ending = run.ending
+    assert ending is not None
+    code, reason = exit_code_of(run), ending.reason
+    failures = [*ending.failures, *run.deaths]
+    verdict = with_failures(latest, failures, _gone(system, failures)) if failures else latest
+    if later := run.deaths[ending.deaths :]:
+        died = ", ".join(f"{each.subject} ({each.rule})" for each in later)
+        reason = f"{reason}, but failed: {died} while it was taken down"
+    if run.hurry and ending.code is ExitCode.OK and code is ExitCode.INTERRUPTED:
+        reason = f"{reason}; interrupted while it was taken down"
+    end = RunEnd(reason=reason, reached=run.furthest or None, exit_code=code, trusted=run.trusted)
+    return UpResult(exit_code=code, verdict=replace(verdict, run=end), plan=run.first)
+
+
+_ENDED = (PROCESS_DIED.id, GAVE_UP.id)
+
+
+def _gone(system: System, failures: Iterable[Failure]) -> frozenset[str]:
+    """Return the names of the nodes that are not there any more, as their process has ended."""
+    processes = {each.process for each in failures if each.rule in _ENDED and each.process}
+    return frozenset(node.name for name in processes for node in system.carried_by(name))
 
 
 T = TypeVar("T")

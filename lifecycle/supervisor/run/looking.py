@@ -38,7 +38,6 @@ from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
 from lifecycle.supervisor.health.liveliness import not_answering
 from lifecycle.supervisor.judging.grace_period import GracePeriod
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify.judge import apart_from_numbers, verify, with_findings
@@ -53,6 +52,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
     from lifecycle.middleware.services.clients import NodeClients
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 
 T = TypeVar("T")
@@ -198,6 +198,8 @@ def _looking(plan: Plan) -> ObserverParticipant:
     hosts = reached_hosts(plan, own_machines(plan, ""))
     os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
     return ObserverParticipant.open(
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
@@ -396,6 +398,8 @@ _Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
 async def _look(
     graph: Graph, wait_s: float, environment: Mapping[str, str] | None
 ) -> tuple[Observation, _Parameters, str, Programs]:
+    from lifecycle.supervisor.nodes.observer_participant import settled
+
     (nodes, endpoints), unsettled = await settled(graph.discovery, wait_s)
     # Before anything is asked: a program may end meanwhile.
     programs = {} if environment is None else graph.discovery.programs(environment)

@@ -16,6 +16,7 @@ import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -51,7 +52,6 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
-from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer
 from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
@@ -87,6 +87,9 @@ from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that are not answered within 4 s.
@@ -339,6 +342,8 @@ async def _observer_participant(
         await _until_interface_is_up(plan, options, emit)
     # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
     load_type_support("rcl_interfaces/msg/ParameterEvent")
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR

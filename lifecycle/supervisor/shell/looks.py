@@ -1,44 +1,28 @@
 """Looks when the core asks for it, and says what is seen of nodes that do not report: Look.
 
 Owns: what is asked once more before a gate opens, which verdicts of a held system are kept back for
-a moment, when to look again although nobody says that something changed, and which node is not
-discovered over TCP although it runs.
-
-Fast DDS 2.14 sometimes never uses a TCP connection that it has dialled: if the answer to its first
-message arrives before the port inside the connection was noted, which happens when the dialling
-thread loses its processor in between, the answer is ignored (BIND_CONNECTION_RESPONSE in
-RTCPMessageManager::processRTCPMessage). Then nothing is sent that way for as long as both
-participants live, and the dialled one takes no other connection from the same port. A participant
-on another port is discovered by all from the beginning.
+a moment, and when to look again although nobody says that something changed.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.restart import moving_nodes
-from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import advance, effects, gate, inputs
-from lifecycle.supervisor.core.state import NEVER_S, Level
+from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
 from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.judging.judge import without
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
-from lifecycle.supervisor.run.events import Notice
-from lifecycle.verify.judge import not_ok
+from lifecycle.supervisor.nodes.system import reached
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
-from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.readiness import shown
-from lifecycle.verify.rules import rule
-from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.health import health_of
-from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
@@ -67,15 +51,8 @@ REMOTE_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
 its announcer may not be matched yet."""
 
-UNCHANGED_S = 5.0
-"""Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
-after 1–4 s; findings that have not changed for so long do not change any more."""
-
 SHOWN_S = 0.5
 """The graph shows the state of a node of others within so long after it changed."""
-
-TRIES = 3
-"""So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
 
 
 class Looks:
@@ -96,9 +73,6 @@ class Looks:
         self._asked: Passage | None = None
         self._seen_last: inputs.Saw | None = None
         self._activated_s: dict[str, float] = {}
-        self._found: frozenset[tuple[str, str]] = frozenset()
-        self._found_s = 0.0
-        self._tries: Counter[str] = Counter()
 
     async def look(self, _: effects.Look) -> None:
         """Look and judge, once a burst of changes is over."""
@@ -167,13 +141,11 @@ class Looks:
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
         if run.change is not None and judge.is_reconciling:
             awaited_s.append(ASK_AGAIN_AT_MOST_S)
-        undiscovered = self._undiscovered(stage, found, now_s, again_s)
         return inputs.Verified(
             mark=mark,
             verdict=verdict,
             again_s=min((*awaited_s, *again_s), default=NEVER_S),
             waits=bool(awaited_s),
-            undiscovered=undiscovered,
             away=away,
         )
 
@@ -183,56 +155,6 @@ class Looks:
         until_s = loop.time() + BURST_S
         while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
             pass
-
-    # Who is not discovered over TCP
-
-    def _undiscovered(
-        self, stage: Stage, found: Verdict, now_s: float, again_s: list[float]
-    ) -> str:
-        """Return the key of the node to be started again on a fresh port; empty if none is."""
-        run = self._system.run
-        same = frozenset((each.rule, each.subject) for each in found.findings)
-        if same != self._found or not self._is_waited_for():
-            self._found, self._found_s = same, now_s
-        if run.asked is None or not run.asked.at_gate or run.opening is not None:
-            self._tries.clear()
-            return ""
-        if stage is not Stage.CONNECTED or not gate.closes(found, strict=run.options.strict):
-            return ""
-        restartable = self._restartable()
-        if not restartable or self._tries.total() >= TRIES:
-            return ""
-        name = undiscovered(found, restartable, self._tries)
-        left_s = self._found_s + UNCHANGED_S - now_s
-        if name is None or run.asked.until_s - run.now_s <= UNCHANGED_S + max(left_s, 0.0):
-            return ""
-        if left_s > 0:
-            again_s.append(left_s)
-            return ""
-        self._tries[name] += 1
-        self._found_s = now_s
-        text = (
-            f"{name!r} is started again on a fresh port: not discovered over TCP "
-            f"for {UNCHANGED_S:g} s ({not_ok(found)}); try {self._tries.total()} of {TRIES}"
-        )
-        self._system.emit(Notice(message=text))
-        node = self._system.node_named(name)
-        assert node is not None
-        return node.core.key
-
-    def _restartable(self) -> frozenset[str]:
-        """Return the names of nodes that could be started again on fresh ports before the gate."""
-        run = self._system.run
-        moving = moving_nodes(run.plan)
-        active = {each.process for each in run.nodes.values() if each.level is Level.ACTIVE}
-        return frozenset(
-            each.name
-            for key, each in run.nodes.items()
-            if key in moving
-            and each.process not in active
-            and each.process in run.processes
-            and run.processes[each.process].state is ProcessState.RUNNING
-        )
 
     # Nodes that do not report
 
@@ -334,47 +256,12 @@ def conditions(planned: PlannedNode, seen: Observation) -> frozenset[Condition]:
     if observed is None:
         return frozenset()
     report = next((each for each in seen.configurations if each.name == name), None)
-    up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
-    said = health_of(planned, own_health(report), observed.health)
-    healthy = (Condition.HEALTHY,) if said.ok else ()
     state = observed.state or (report.state if report is not None else "")
-    if not planned.managed or state == ACTIVE:
-        return frozenset((*up_to_active, *healthy))
-    if state != INACTIVE:
-        return frozenset((Condition.STARTED,))
-    # A node that is not ours makes its data layer in configure, and has no such report.
-    if report is None or report.connected:
-        return frozenset(up_to_active[:3])
-    return frozenset(up_to_active[:2])
-
-
-def undiscovered(
-    verdict: Verdict, restartable: Collection[str], tries: Mapping[str, int]
-) -> str | None:
-    """Return the full name of the node to start again; None where that would mend nothing.
-
-    Of two ends that do not match either may be the undiscovered one: it is who lacks most,
-    then who was started again least often, then the last by name.
-
-    Args:
-        verdict: that keeps the gate closed.
-        restartable: full names of nodes that get fresh ports when they are started again, and whose
-            process is ours and holds no active node.
-        tries: how often each was started again before.
-    """
-    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
-    if not all(rule(each.rule).if_undiscovered for each in violated):
-        return None
-    missing = [each for each in violated if each.rule == MISSING_NODE.id]
-    # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.
-    coming = (each for each in violated if rule(each.rule).about is About.PROGRESS)
-    awaited = {each.node for each in (*missing, *coming)}
-    unmatched = (each for each in violated if rule(each.rule).about is About.MATCH)
-    pairs = (each.ends for each in unmatched if awaited.isdisjoint(each.ends))
-    lacks = Counter(
-        name
-        for names in (*pairs, *((each.node,) for each in missing))
-        for name in names
-        if name in restartable
-    )
-    return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)
+    level = Level.ACTIVE
+    if planned.managed:
+        # A node that is not ours makes its data layer in configure, and has no such report.
+        level = reached(state, connected=report is None or report.connected)
+    found = {condition for condition, least in HOLDS.items() if least <= level}
+    if not health_of(planned, own_health(report), observed.health).ok:
+        found.discard(Condition.HEALTHY)
+    return frozenset(found)

@@ -14,7 +14,7 @@ from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
-from lifecycle.node.host.control import Command, HostSpec, Operation
+from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import effects, inputs
@@ -110,15 +110,8 @@ class Processes:
 
     def measure(self) -> None:
         """Have hosts count what the plan that is now in force has numbers of."""
-        if not self._system.plan.bounds:
-            return
-        for process in self._system.processes.values():
-            if process.channel is not None and not process.ended.done():
-                node = self._system.nodes[process.planned.nodes[0]].name
-                measure = Command(
-                    node=node, operation=Operation.MEASURE, apart=self._apart(process)
-                )
-                self._shell.start(process.channel.have(measure))
+        if self._system.plan.bounds:
+            self._system.have_hosts(Operation.MEASURE, self._apart)
 
     def _ended(self, process: ManagedProcess) -> None:
         """Say how a process ended; of one that was starting, once all is read that it said."""

@@ -21,6 +21,7 @@ from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
 from lifecycle.supervisor.core.state import REACHES, Level, Step
 from lifecycle.supervisor.nodes.adoption import ran_before
@@ -48,6 +49,10 @@ if TYPE_CHECKING:
 _DEATH_S = 0.5
 """A closed channel usually means a dying process; its end says more than the channel did."""
 
+_SLICE_S = 1.0
+"""A late step that has waited for a CPU gets that time; less than this, or a tenth of its limit, is
+not worth another look."""
+
 _REOPENS_S = 1.0
 """What changes as others are activated is judged within milliseconds, on a loaded machine later."""
 
@@ -64,13 +69,33 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
+        self._delay_s: dict[str, float] = {}
         self._found: set[str] = set()
 
     def ask(self, effect: effects.Ask) -> None:
         """Ask a node for a step."""
         node = self._system.nodes[effect.node]
+        self._delay_s[effect.node] = node.run_delay_s()
         task = self._shell.start(self._carry_out(node, effect))
         self._tasks[effect.node] = effect.number, task
+
+    def tick(self, at_s: float) -> inputs.Tick:
+        """Return a tick with what is known of late requests: time without a CPU does not count."""
+        waited_s: dict[str, float] = {}
+        where: dict[str, str] = {}
+        for key, each in self._system.run.nodes.items():
+            request, node = each.request, self._system.nodes[key]
+            if request is None or at_s < late_at_s(request):
+                continue
+            # Threads that wait at once have waited no longer for it.
+            delay_s = max(0.0, node.run_delay_s() - self._delay_s[key])
+            delay_s = min(delay_s, at_s - request.since_s)
+            left_s = late_at_s(replace(request, waited_s=delay_s)) - at_s
+            if left_s >= min(_SLICE_S, request.limit_s / 10):
+                waited_s[key] = delay_s
+            else:
+                where[key] = node.where()
+        return inputs.Tick(at_s=at_s, waited_s=waited_s, where=where)
 
     def drop(self) -> None:
         """End what is done for requests that the core has given up."""

@@ -53,12 +53,10 @@ from lifecycle.supervisor.run.events import (
     ProcessChanged,
     Stopped,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, ended
+from lifecycle.supervisor.run.failure import StepFailedError, ended, result_of
 from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
-from lifecycle.supervisor.shell.ending import result_of
-from lifecycle.supervisor.shell.load import Load
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
@@ -148,7 +146,6 @@ class Supervisor:
         self._processes = Processes(self)
         self._requests = Requests(self)
         self._looks = Looks(self)
-        self._load = Load(system)
         self._ros_interface = RosInterface(self)
         self._server = ControlServer(means.directory.socket_path, self)
         self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
@@ -305,13 +302,10 @@ class Supervisor:
     def _wake_at(self, effect: effects.Wake) -> None:
         if self._wake is not None:
             self._wake.cancel()
-        wait_s = max(0.0, min(effect.at_s, self._load.next_s(self.now_s())) - self.now_s())
-        self._wake = self._loop.call_later(wait_s, self._tick)
-
-    def _tick(self) -> None:
-        at_s = self.now_s()
-        waited_s, where = self._load.measure(at_s)
-        self.give(inputs.Tick(at_s=at_s, waited_s=waited_s, where=where))
+        wait_s = max(0.0, effect.at_s - self.now_s())
+        self._wake = self._loop.call_later(
+            wait_s, lambda: self.give(self._requests.tick(self.now_s()))
+        )
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Carry something out beside the loop; it is over before the run is."""

@@ -257,6 +257,15 @@ def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, 
     assert (play.code, play.reason) == (code, f"{why}: /intruder (graph.undeclared-node)")
 
 
+def test_a_violation_that_lasted_counts_also_where_nothing_is_to_be_activated() -> None:
+    play = Play(plan_of(planned_node("driver", managed=False, kind=RunKind.COMMAND)), hold_s=10.0)
+    play.see(INTRUDER)
+    play.wait(2.0)
+    play.see()
+    play.wait(10.0)
+    assert play.code == 4
+
+
 # Orders
 
 
