@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import re
 import signal
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ from lifecycle.supervisor.control.client import look
 from lifecycle.verify.verdict import FlowMeasurement
 from tests.net.hosts import Host
 from tests.net.other_clock import other_clock
-from tests.net.running import article, run_directory, up_on
+from tests.net.running import article, run_directory, up_on, verb_on
 from tests.ros.supervisor.running import Up
 
 _BOUND_MS = 40
@@ -66,6 +67,18 @@ def _measured(directory: Path, machine: str) -> FlowMeasurement | None:
     return next((each for each in verdict.measured if each.topic == "/video"), None)
 
 
+def _shown(host: Host, directory: Path) -> Iterator[dict[str, str]]:
+    """What `flows` says of the video, and what it records, on the host that receives it."""
+    file = directory / "flows.csv"
+    manifest = str(directory / "article.lifecycle.yaml")
+    flows = ("flows", manifest, "--format", "csv")
+    for words in (flows, ("flows", "article", "--record", str(file), "--for", "1")):
+        done = verb_on(host, *words, runtime=directory / "b")
+        assert done.returncode == ExitCode.OK, done.stderr
+        text = done.stdout or file.read_text(encoding="utf-8")
+        yield next(each for each in csv.DictReader(text.splitlines()) if each["topic"] == "/video")
+
+
 @pytest.mark.parametrize("ahead_s", [0.5, -0.5])
 @pytest.mark.parametrize("edit", [{}, _SIM_TIME], ids=["", "use_sim_time"])
 def test_a_delay_that_is_kept_is_ok_with_numbers_whatever_the_clocks_say(
@@ -81,6 +94,8 @@ def test_a_delay_that_is_kept_is_ok_with_numbers_whatever_the_clocks_say(
         up_b.catch_up()
         true_ms = float(str(up_b.until("log")["line"]).removeprefix("median "))
         flow = _measured(tmp_path, "b")
+        for row in _shown(pair[1], tmp_path):
+            assert abs(float(row["p50_ms"]) - true_ms) < 20, row
         # Who publishes counts nothing, and judges nothing.
         assert _measured(tmp_path, "a") is None
         for up in (up_a, up_b):
