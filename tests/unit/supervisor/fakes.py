@@ -20,12 +20,12 @@ from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import DiscoveryRange, EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
-from lifecycle.supervisor.run.events import Emitter
+from lifecycle.supervisor.run.events import Emitter, RunStarted
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport, Outcome
@@ -71,11 +71,18 @@ class JumpingLoop(asyncio.SelectorEventLoop):
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a test's coroutine in a loop whose clock jumps."""
+    """Run a test's coroutine in a loop whose clock jumps; end what it has left, as asyncio.run."""
     loop = JumpingLoop()
+
+    async def end(left: set[asyncio.Task[Any]]) -> None:
+        for each in left:
+            each.cancel()
+        await asyncio.gather(*left, return_exceptions=True)
+
     try:
         return loop.run_until_complete(main)
     finally:
+        loop.run_until_complete(end(asyncio.all_tasks(loop)))
         loop.close()
 
 
@@ -378,6 +385,25 @@ class FakeForkServer:
 
     async def close(self) -> None:
         """Nothing to close."""
+
+
+def run_started(*nodes: str, **changes: Any) -> RunStarted:
+    """How the run of these nodes, a process each, begins."""
+    values = {"system": "robot", "domain_id": 30, "rmw": "rmw_fastrtps_cpp", **changes}
+    return RunStarted(
+        discovery_range="localhost",
+        nodes=nodes,
+        processes=tuple(each.removeprefix("/") for each in nodes),
+        log_directory="/log",
+        **values,
+    )
+
+
+def host_spec(*nodes: PlannedNode, **changes: Any) -> HostSpec:
+    """What a host of these nodes is told at its start."""
+    where = DiscoveryRange.LOCALHOST
+    values = {"system": "robot", "process": nodes[0].process, **changes}
+    return HostSpec(domain_id=0, discovery_range=where, nodes=nodes, **values)
 
 
 def verdict(*found: tuple[str, ...], outcome: Outcome | None = None) -> Verdict:

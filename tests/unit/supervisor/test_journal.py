@@ -18,11 +18,11 @@ from msgspec.structs import replace
 
 from lifecycle.cli.verbs import history
 from lifecycle.errors import UsageError
-from lifecycle.supervisor.run.events import Notice, RunStarted, Stopped, VerdictChanged
+from lifecycle.supervisor.run.events import Notice, Stopped, VerdictChanged
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
-from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.fakes import run_started, verdict_of
 
 VERDICT = VerdictChanged(
     stage=Stage.CONNECTED, verdict=verdict_of(Outcome.VIOLATED, "graph.missing-node")
@@ -94,15 +94,7 @@ def _verb(command: object, *words: str) -> tuple[int, str]:
 
 
 def test_the_verbs_tell_a_run_whose_supervisor_was_killed(kept: Kept) -> None:
-    started = RunStarted(
-        system="robot",
-        domain_id=3,
-        rmw="rmw_fastrtps_cpp",
-        discovery_range="localhost",
-        nodes=("/camera", "/viewer"),
-        processes=("camera", "viewer"),
-        log_directory="here",
-    )
+    started = run_started("/camera", "/viewer")
     kept.journal._run = replace(kept.journal._run, supervisor=2**22 + 1)
     kept.journal.on_event(started)
     kept.journal.on_event(VERDICT)

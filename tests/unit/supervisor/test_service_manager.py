@@ -13,7 +13,6 @@ import pytest
 
 from lifecycle.supervisor.run.events import (
     GateOpened,
-    RunStarted,
     Stopping,
     SystemReached,
     VerdictChanged,
@@ -21,7 +20,7 @@ from lifecycle.supervisor.run.events import (
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
-from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.fakes import run_started, verdict_of
 
 
 @pytest.fixture
@@ -44,17 +43,7 @@ def test_a_system_is_ready_when_it_is_active_and_not_before(
     manager: socket.socket, tmp_path: Path
 ) -> None:
     service = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")})
-    service.on_event(
-        RunStarted(
-            system="arm",
-            domain_id=0,
-            rmw="rmw_fastrtps_cpp",
-            discovery_range="localhost",
-            nodes=("/a", "/b"),
-            processes=("a", "b"),
-            log_directory="",
-        )
-    )
+    service.on_event(run_started("/a", "/b", system="arm"))
     service.on_event(SystemReached(reached="connected", elapsed_s=1.0))
     service.on_event(
         VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(Outcome.VIOLATED, "graph.x"))

@@ -7,9 +7,8 @@ import socket
 
 import pytest
 
-from lifecycle.manifest.model import DiscoveryRange, Timeouts
+from lifecycle.manifest.model import Timeouts
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
-from lifecycle.node.host.control import HostSpec
 from lifecycle.supervisor.health.liveliness import Cause, SilenceMonitor
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
 from lifecycle.supervisor.run.events import (
@@ -17,6 +16,7 @@ from lifecycle.supervisor.run.events import (
     Event,
 )
 from tests.builders import planned_node
+from tests.unit.supervisor.fakes import host_spec
 
 
 class Ears:
@@ -62,15 +62,8 @@ def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
 
     async def test() -> None:
         node = planned_node("camera", timeouts=Timeouts(silent_s=0.05))
-        spec = HostSpec(
-            system="robot",
-            process="p",
-            domain_id=0,
-            discovery_range=DiscoveryRange.LOCALHOST,
-            nodes=(node,),
-        )
         told: asyncio.Queue[Overdue | None] = asyncio.Queue()
-        channel = ControlChannel(spec, lambda _: None, told.put_nowait)
+        channel = ControlChannel(host_spec(node), lambda _: None, told.put_nowait)
         theirs = await channel.open()
         _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)
         sign = BusySign(*descriptors)

@@ -31,7 +31,6 @@ from lifecycle.supervisor.run.events import (
     NodeChanged,
     ProcessChanged,
     RequestSent,
-    RunStarted,
     SystemReached,
     VerdictChanged,
     to_record,
@@ -42,7 +41,7 @@ from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
 from tests.builders import nfe, node, publisher
 from tests.builders import planned as planned_of
-from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.fakes import run_started, verdict_of
 
 EVENTS: tuple[Event, ...] = (
     ProcessChanged(process="camera", state=ProcessState.RUNNING, pid=7),
@@ -172,17 +171,8 @@ def test_a_stage_is_over_with_the_last_node_that_came_so_far() -> None:
     def judged(outcome: Outcome) -> Event:
         return VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(outcome))
 
-    run = RunStarted(
-        system="robot",
-        domain_id=30,
-        rmw="rmw_fastrtps_cpp",
-        discovery_range="localhost",
-        nodes=("/camera", "/arm"),
-        processes=("camera", "arm"),
-        log_directory="/log",
-    )
     came = (
-        (0.5, run),
+        (0.5, run_started("/camera", "/arm")),
         (1.0, NodeChanged(node="/camera", reach=Reach.STARTED)),
         (1.2, NodeChanged(node="/camera", reach=Reach.CONNECTED)),
         (1.5, NodeChanged(node="/arm", reach=Reach.STARTED)),

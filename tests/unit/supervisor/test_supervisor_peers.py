@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, Quantity, Run, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
-from lifecycle.node.host.control import HostSpec, Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.comparison import decode, encode, notice_of
 from lifecycle.plan.model import Plan, PlannedFlow
 from lifecycle.supervisor.core.state import install
@@ -28,7 +28,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.verdict import Verdict
 from tests.builders import HERE, plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import World, host_spec, run
 from tests.unit.supervisor.session_world import FakeAir
 
 DESK = supervisor_alive_topic("robot", "desk")
@@ -147,7 +147,6 @@ async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_
         "/viewer": False,
         "/lamp": True,
     }
-    await robot.peers.close()
 
 
 async def test_silence_is_said_again_and_again_and_that_of_others_is_taken_over(
@@ -166,7 +165,6 @@ async def test_silence_is_said_again_and_again_and_that_of_others_is_taken_over(
     await asyncio.sleep(1)
     (said,) = robot.air.announced.values()
     assert said[-6:] == [{"/camera": "it hangs"}] * 3 + [{}] * 3
-    await robot.peers.close()
 
 
 def attached(*keys: str) -> Plan:
@@ -206,7 +204,6 @@ async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others
     air.watched[sonar].alive(False)
     await settle()
     assert set(silent.silent) == {"/radar", "/sonar"}
-    await robot.peers.close()
 
 
 @pytest.mark.parametrize("came_back", [True, False])
@@ -216,13 +213,7 @@ async def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_say_our_names_an
     robot = Robot(tmp_path)
     (planned,) = [each for each in robot.system.plan.processes if each.name == "camera"]
     process = robot.system.processes["camera"] = robot.system.make_process(planned)
-    spec = HostSpec(
-        system="robot",
-        process="camera",
-        domain_id=0,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        nodes=robot.system.plan.nodes[:1],
-    )
+    spec = host_spec(robot.system.plan.nodes[0])
     await process.spawn(robot.hosts, ControlChannel(spec, robot.system.on_host_event))
     await process.channel.ready()
     await robot.alive(True)
@@ -292,7 +283,6 @@ async def test_each_machine_that_does_not_say_what_it_planned_is_waited_for_and_
     assert robot.found(both) == [UNKNOWN, WAITS]
     await robot.receives(plan, machines=("desk", "far"))
     assert robot.found(both) == []
-    await robot.peers.close()
 
 
 async def test_a_node_without_a_machine_or_attached_has_no_supervisor_to_wait_for(
@@ -313,7 +303,6 @@ async def test_a_node_without_a_machine_or_attached_has_no_supervisor_to_wait_fo
     robot.air.watched[supervisor_alive_topic("robot", "bench")].alive(True)
     await settle()
     assert waited_for() == supervisors
-    await robot.peers.close()
 
 
 async def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Path) -> None:
@@ -379,7 +368,6 @@ async def test_a_plan_is_announced_where_another_supervisor_may_be(
     robot.peers.announce()
     robot.peers.leave("lifecycle down")
     assert len(robot.air.plans) == 3 * announced
-    await robot.peers.close()
 
 
 def test_what_is_no_notice_or_comes_after_the_end_changes_nothing(
@@ -472,4 +460,3 @@ async def test_clocks_are_compared_once_a_second_while_a_delay_between_machines_
     robot.peers.announce()
     await asyncio.sleep(1.1 * EXCHANGED_S)
     assert len(robot.air.received) == 2
-    await robot.peers.close()

@@ -18,8 +18,6 @@ import pytest
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Resources, Run, RunKind
-from lifecycle.node.host.control import HostSpec
-from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.processes import logs, scope
@@ -38,7 +36,8 @@ from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter, LogLine
 from lifecycle.verify.outcome import Outcome
-from tests.builders import teleop
+from tests.builders import planned_node
+from tests.unit.supervisor.fakes import host_spec
 
 PYTHON = sys.executable
 BOUND_S = 20.0
@@ -184,15 +183,7 @@ async def test_whoever_writes_faster_than_we_read_does_not_keep_a_pipe_from_bein
 
 
 async def test_a_host_that_reads_nothing_any_more_does_not_keep_its_channel_from_closing() -> None:
-    plan = build_plan(teleop())
-    spec = HostSpec(
-        system="s" * 2**22,
-        process="p",
-        domain_id=0,
-        discovery_range=plan.discovery_range,
-        nodes=plan.nodes,
-    )
-    channel = ControlChannel(spec, lambda _: None)
+    channel = ControlChannel(host_spec(planned_node("p"), system="s" * 2**22), lambda _: None)
     with await channel.open():
         await channel.close()
 
