@@ -364,7 +364,7 @@ def of_supervisors(
             found.append(each)
             if _is_status(each.kind, each.name):
                 claims.setdefault(each.name.rpartition("/")[0], set()).add(_claim(each))
-        elif _is_alive(each) and (prefix := alive.get((each.name, each.type))) is not None:
+        elif _may_assert(each) and (prefix := alive.get((each.name, each.type))) is not None:
             asserting.append(each)
             claims.setdefault(prefix, set()).add(_claim(each))
     access = plan.policy.access
@@ -416,15 +416,19 @@ def _alive(plan: Plan) -> dict[tuple[str, str], str]:
     }
 
 
-def _is_alive(endpoint: ObservedEndpoint) -> bool:
+def _may_assert(endpoint: ObservedEndpoint) -> bool:
     """Return whether an endpoint may be one by which a supervisor asserts its liveliness."""
-    name = endpoint.node.rpartition("/")[2]
-    return endpoint.kind is EndpointKind.PUBLISHER and matches(name, OUR_NODES)
+    return endpoint.kind is EndpointKind.PUBLISHER and _is_observer(endpoint.node)
+
+
+def _is_observer(full_name: str) -> bool:
+    """Return whether a node is called as an observer of ours is."""
+    return bool(tolerating_pattern(full_name, ()))
 
 
 def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
     """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
-    if not matches(node.rpartition("/")[2], OUR_NODES):
+    if not _is_observer(node):
         return False
     base = name.rpartition("/")[2] if name.startswith(SUPERVISORS) else ""
     if kind is EndpointKind.PUBLISHER:
@@ -453,7 +457,7 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     """
     if not node:
         return False
-    of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
+    of_observers = name.startswith(_OUR_TOPICS) and _is_observer(node)
     of_observers = of_observers or is_supervisor_endpoint(kind, node, name, type_)
     of_library = _is_service_event(kind, name, type_) or NOISE_TOPICS.get((kind, name)) == type_
     if of_observers or of_library:

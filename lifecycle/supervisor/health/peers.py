@@ -402,7 +402,6 @@ class Peers:
             who = _who(notice, self._system.plan.system)
             theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
-                outcome=Outcome.VIOLATED,
                 subject=who,
                 expected=f"plan {ours}",
                 observed=f"plan {theirs}",

@@ -51,7 +51,6 @@ def check(view: View) -> Iterator[Finding]:
 def _finding(warning: Diagnostic) -> Finding:
     rule = REACHED_NONE if warning.rule in _NO_NODE else UNPROVEN
     return rule.finding(
-        outcome=Outcome.UNVERIFIABLE,
         subject=warning.at.path or warning.at.file,
         expected="no warning",
         observed=warning.rule,

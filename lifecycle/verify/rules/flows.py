@@ -139,7 +139,6 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     unproven = ", which is not proven" if met is None else ""
     rule = UNVERIFIABLE if met is None else NOT_UNIQUE
     yield rule.finding(
-        outcome=Outcome.VIOLATED,
         subject=flow.subject,
         ends=flow.ends,
         expected=f"{how} unique flow",

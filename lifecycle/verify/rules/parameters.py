@@ -217,7 +217,6 @@ def _finding(
     hint: str = "",
 ) -> Finding:
     return rule.finding(
-        outcome=Outcome.VIOLATED,
         subject=f"{node.full_name}: {expected.name}",
         expected=wanted,
         observed=observed,

@@ -135,7 +135,6 @@ def _finding(
         users[0].at,
     )
     return rule.finding(
-        outcome=Outcome.VIOLATED if Outcome.VIOLATED in rule.outcomes else Outcome.UNVERIFIABLE,
         subject=CLOCK[0],
         expected=expected,
         observed=observed,

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, ms, percentile, too_many_late
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, buckets_of, least_ns
-from lifecycle.measure.sample import DELAY_S, SLOT_S, Sample, Slot
+from lifecycle.measure.sample import DELAY_S, SLOT_S, Measured, Sample, Slot
 
 NS = 10**9
 WALL = 1_700_000_000 * NS
@@ -69,6 +69,7 @@ def test_a_quantile_is_the_exact_one_within_the_known_error(
 
 def test_no_message_has_no_quantile_and_what_came_too_early_counts_as_no_delay() -> None:
     assert Delays().quantile_ms(0.99) is None
+    assert Measured(active_s=1.0).of("/a") is None
     assert buckets_of((-5,))[0] == 0
     too_long = buckets_of((LONGEST_NS * 4,))[0]
     both = Delays.of(({too_long: 1}, {-too_long: 2}))

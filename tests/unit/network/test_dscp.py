@@ -6,13 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.dscp import (
-    code_points,
-    describe,
-    dscp_name,
-    parse_dscp,
-    tos,
-)
+from lifecycle.network.dscp import code_points, describe, dscp_name, parse_dscp, tos
 
 NAMES = (
     "DF, LE, CS1, AF11, AF12, AF13, CS2, AF21, AF22, AF23, CS3, AF31, AF32, AF33, CS4, AF41, AF42, "

@@ -9,13 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.five_qi import (
-    ResourceType,
-    check_class,
-    five_qi_of,
-    five_qis,
-    propose,
-)
+from lifecycle.network.five_qi import ResourceType, check_class, five_qi_of, five_qis, propose
 
 GBR, NON_GBR = ResourceType.GBR, ResourceType.NON_GBR
 DELAY_CRITICAL = ResourceType.DELAY_CRITICAL_GBR

@@ -19,10 +19,7 @@ from lifecycle.manifest.qos import (
     QosProfile,
     Reliability,
 )
-from lifecycle.network.nfe import (
-    NetworkFlowEndpoint,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedParticipant
 from lifecycle.verify.observation import (
     EndpointReport,

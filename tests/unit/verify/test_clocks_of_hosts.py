@@ -12,10 +12,12 @@ from lifecycle.measure.delays import Delays, signed_buckets_of
 from lifecycle.measure.sample import Measured, Sample
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import apart_from_numbers, verify
+from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.measured import compares_clocks
 from lifecycle.verify.verdict import Stage, Verdict
 from tests.builders import at, link, node, planned, publisher, subscription
+from tests.unit.verify.edits import both, change_configuration
 from tests.unit.verify.perfect import perfect
 
 MS = 1_000_000
@@ -115,6 +117,7 @@ def test_what_the_clocks_do_not_let_decide_is_unverifiable_by_name_after_a_while
     assert [each.outcome for each in late.measured[0].bounds] == ["unverifiable"]
     other = judged(system(), *clocks, delay_ms=delay_ms + 0.01)
     assert apart_from_numbers(other) == apart_from_numbers(late)
+    assert [each.rule for each in apart_from_numbers(late).findings] == ["flow.not-measured"]
 
 
 def test_a_5qi_is_named_with_its_budget() -> None:
@@ -163,6 +166,11 @@ def test_a_host_without_a_supervisor_of_its_own_is_named_from_the_first_gate_on(
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
     (found,) = verdict.findings
     assert found.message == f"{WHERE} the clocks of the two hosts are not compared"
+    both_here = [
+        change_configuration(name, identity=Identity(machine_id="m", process_id=1, node_id=""))
+        for name in ("/camera", "/viewer")
+    ]
+    assert verify(plan, both(*both_here)(perfect(plan)), stage=Stage.CONNECTED).findings == ()
 
 
 def test_clocks_are_compared_where_a_delay_is_declared_and_data_pass_between_machines() -> None:

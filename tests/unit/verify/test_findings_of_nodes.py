@@ -14,14 +14,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipan
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation
 from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.verdict import Finding, Stage
-from tests.builders import (
-    endpoint,
-    node,
-    planned,
-    publisher,
-    subscription,
-    teleop,
-)
+from tests.builders import endpoint, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     add_configuration,

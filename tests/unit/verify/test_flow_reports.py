@@ -19,12 +19,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, FlowReport, Stage
 from tests.builders import at, node, planned, publisher, subscription, teleop
-from tests.unit.verify.edits import (
-    Edit,
-    both,
-    change_report,
-    drop_report,
-)
+from tests.unit.verify.edits import Edit, both, change_report, drop_report
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 

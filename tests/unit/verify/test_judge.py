@@ -135,6 +135,8 @@ def test_what_a_supervisor_offers_in_ros_is_its_own_and_no_one_elses() -> None:
     assert {each[1] for each in both_claim} == {ours, other}
     assert (publisher_rule, other, "/lifecycle/robot/status") in both_claim
     assert (server_rule, other, "/lifecycle/robot/get_status") in both_claim
+    third = supervisor(3, "others")
+    assert {each[1] for each in rules(plan, supervisor(1), supervisor(2), third)} == {ours, other}
     tool = add_endpoint(SERVER, "/rqt_1", "/lifecycle/robot/pause", type=TRIGGER)
     assert rules(plan, supervisor(1), tool) == [(server_rule, "/rqt_1", "/lifecycle/robot/pause")]
     pauses = add_endpoint(SERVER, ours, "/lifecycle/robot/pause", type=TRIGGER)

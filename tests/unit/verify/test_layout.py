@@ -13,13 +13,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation, ObservedEndpoint
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual, View, actual_qos
-from tests.builders import (
-    node,
-    planned,
-    publisher,
-    subscription,
-    teleop,
-)
+from tests.builders import node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

@@ -9,8 +9,10 @@ from lifecycle.manifest.model import EndpointKind, Executor, Machine, Quantity, 
 from lifecycle.measure.delays import Delays, buckets_of
 from lifecycle.measure.sample import Measured, Sample, Slot
 from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import without_measured
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.report import render_text
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import both, change_configuration, change_report
@@ -56,12 +58,14 @@ def arrived(
     )
 
 
-def judged(plan: Plan, sample: Sample | None, stage: Stage = Stage.ACTIVE) -> Verdict:
+def judged(
+    plan: Plan, sample: Sample | None, stage: Stage = Stage.ACTIVE, *, let_s: float = 99.0
+) -> Verdict:
     seen: Observation = perfect(plan, stage)
     if sample is not None:
         counted = Measured(active_s=sample.seconds, samples=(("/a", sample),))
         seen = change_configuration("/two", measured=counted)(seen)
-        seen = change_configuration("/one", measured=Measured(active_s=sample.seconds + 2))(seen)
+        seen = change_configuration("/one", measured=Measured(active_s=let_s))(seen)
     return verify(plan, seen, stage=stage)
 
 
@@ -96,6 +100,10 @@ def test_a_declared_number_is_ok_or_violated_with_numbers_wherever_it_is_declare
     assert [(each.rule, each.subject) for each in of_data(bad)] == [(rule, "/a: /one → /two")]
     assert of_data(bad)[0].expected == str(quantity)
     assert of_data(bad)[0].at == "robot.lifecycle.yaml:22:1"
+    gated = without_measured(bad, plan.policy)
+    assert (gated.verdict, gated.blocking, of_data(gated), gated.measured) == (
+        *(Outcome.OK, False, [], ()),
+    )
 
 
 def test_a_violated_delay_is_said_with_quantile_value_and_bound() -> None:
@@ -110,7 +118,7 @@ def test_what_cannot_be_decided_yet_is_shown_and_counts_for_nothing() -> None:
     assert verdict.verdict is Outcome.OK
     bound = verdict.measured[0].bounds[0]
     assert (bound.outcome, bound.text) == ("measuring", "delay p99 8 ms, measuring ≤ 5 ms")
-    assert bound.decides_in_s == pytest.approx(4.0)
+    assert (bound.decides_in_s, bound.share) == (4.0, pytest.approx(1.6, rel=0.02))
 
 
 def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
@@ -125,6 +133,8 @@ def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
     (silent,) = judged(plan, Sample(seconds=1.0)).measured
     assert (silent.messages, silent.p50_ms, silent.p99_ms) == (0, None, None)
     assert [each.text for each in silent.bounds] == ["≤ 5 ms", "≤ 0.001"]
+    text = render_text(judged(plan, sample), flows=False)
+    assert text == f"verdict: ok (1 flow)\n\nmeasured\n  {flow.describe()}\n"
 
 
 @pytest.mark.parametrize(
@@ -135,6 +145,7 @@ def test_nothing_is_judged_while_an_end_says_that_it_is_not_active(
     name: str, state: str, judged_: int
 ) -> None:
     plan = pair(number("rate_hz", 15))
+    assert judged(plan, arrived(50, 10), let_s=3.0).findings == ()  # its publisher only began
     counted = change_configuration(
         "/two", measured=Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
     )

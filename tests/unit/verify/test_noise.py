@@ -228,6 +228,8 @@ def test_parts_of_an_action_client_that_is_there_already_are_no_second_one():
     known = ObservedEndpoint(kind=ACTION_CLIENT, node="/ui", name="/dock", type="robot/action/Dock")
     of_client = [replace(each, node="/ui", kind=each.kind.other_end) for each in parts()]
     assert fold_actions([known, *of_client, *parts()]) == (known, *fold_actions(parts()))
+    assert fold_actions([*of_client, *of_client]) == (known,)
+    assert fold_actions([*parts(), *parts()]) == 2 * fold_actions(parts())
 
 
 def test_observers_notice_each_other_by_topics_that_are_nobody_elses():

@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, UniqueHow
-from lifecycle.network.nfe import (
-    NetworkFlowEndpoint,
-    TransportProtocol,
-    dissimilar,
-    is_ip,
-    located,
-)
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, dissimilar, is_ip, located
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Identity
@@ -24,20 +18,8 @@ from lifecycle.verify.uniqueness import Uniqueness, meets
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual
 from tests import builders
-from tests.builders import (
-    configuration,
-    node,
-    planned,
-    publisher,
-    reported,
-    subscription,
-)
-from tests.unit.verify.edits import (
-    Edit,
-    both,
-    change_configuration,
-    change_report,
-)
+from tests.builders import configuration, node, planned, publisher, reported, subscription
+from tests.unit.verify.edits import Edit, both, change_configuration, change_report
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -5,9 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lifecycle.manifest.model import EndpointKind, Quantity, Run, RunKind, UniqueHow
-from lifecycle.network.nfe import (
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import Observation

@@ -5,21 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import (
-    EndpointKind,
-    EndpointPolicy,
-    Health,
-    Policy,
-    Run,
-    RunKind,
-)
-from lifecycle.manifest.qos import (
-    Durability,
-    History,
-    QosProfile,
-    Reliability,
-    not_written,
-)
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Health, Policy, Run, RunKind
+from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability, not_written
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import EndpointReport, HealthReport, Observation

@@ -18,12 +18,7 @@ from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.transport import carrier
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import (
-    Edit,
-    both,
-    change_configuration,
-    change_report,
-)
+from tests.unit.verify.edits import Edit, both, change_configuration, change_report
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
