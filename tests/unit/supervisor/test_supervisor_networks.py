@@ -161,6 +161,16 @@ async def test_a_later_failure_is_a_notice_and_tried_again(
     assert said[:2] == ["fake", "cannot write nft table inet flowqos_s"]
 
 
+async def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
+    notices = Notices()
+    networks = Networks("s", tmp_path, notices.emit)
+    await networks.begin(verdict("/gate"))
+    notices.emit(heard("/later"))
+    await networks.close(asyncio.Event())
+    assert notices.said == []
+    assert list(tmp_path.iterdir()) == []  # noqa: ASYNC240
+
+
 class Applied:
     """A NEF subscription that somebody, or a supervisor, made for a run."""
 

@@ -424,7 +424,7 @@ def test_a_mode_that_takes_one_out_and_another_in_waits_for_it_at_the_gate_of_th
 ):
     play = Play(modes("normal", "degraded", "blind"))
     play.see(INTRUDER)
-    play.order(MODE, mode="degraded")
+    assert play.order(MODE, mode="degraded") == ["camera deactivate"]
     play.order(MODE, mode="normal")
     play.wait(1.0)
     assert (play.levels, play.phase, play.run.mode) == ("4 3", "active", "degraded")
@@ -439,6 +439,8 @@ def test_a_mode_that_takes_one_out_and_another_in_waits_for_it_at_the_gate_of_th
     play.see()
     play.order(RESUME)
     assert (play.levels, play.phase) == ("4 3", "active")
+    play.order(MODE, mode="normal")
+    assert play.levels == "4 4"
 
 
 def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_its_mode_says() -> None:
@@ -560,7 +562,8 @@ def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_ag
     ]
 
 
-def test_a_mode_that_a_node_refuses_is_said_and_the_system_goes_on() -> None:
+@pytest.mark.parametrize("ordered", [True, False])
+def test_a_mode_that_a_node_refuses_is_left_again_with_the_node_s_reason(ordered: bool) -> None:
     given = ModeParameters(mode="blind", parameters=rate(CAMERA, 2.0).expected_parameters)
     what = Reaction(rule="graph", what=Consequence.MODE, mode="blind")
     plan = modes("normal", "blind")
@@ -568,11 +571,14 @@ def test_a_mode_that_a_node_refuses_is_said_and_the_system_goes_on() -> None:
     camera = replace(camera, mode_parameters=(given,))
     plan = replace(plan, nodes=(base, camera), on_violation=(what,))
     play = Play(plan, ways={"give camera": "read-only"})
-    play.see(INTRUDER)
-    play.wait(0.6)
+    reason = "cannot enter mode 'blind': read-only"
+    back = "cannot enter mode 'blind': back to 'normal'"
+    if ordered:
+        play.order(MODE, mode="blind")
+        assert play.answers[0] == (6, reason)
+    else:
+        play.see(INTRUDER)
+        play.wait(0.6)
     said = [each.message for each in play.heard(Notice)]
-    assert said == [
-        "cannot enter mode 'blind': back to 'normal'",
-        "cannot enter mode 'blind': read-only",
-    ]
-    assert play.run.mode == "normal"
+    assert said == ([back] if ordered else [back, reason])
+    assert (play.run.mode, play.levels) == ("normal", "4 4" if ordered else "3 4")

@@ -13,12 +13,10 @@ from lifecycle.manifest.model import (
     BY_DEFAULT,
     Condition,
     Consequence,
-    Mode,
     OnFailure,
     Reaction,
     RunKind,
 )
-from lifecycle.plan.model import ExpectedParameter, ModeParameters
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
 from lifecycle.supervisor.core.reduce import take
@@ -79,16 +77,6 @@ def test_a_system_is_brought_as_far_as_asked(
     assert play.code == 0
 
 
-def test_nothing_is_activated_on_a_violated_verdict_and_what_stays_wrong_ends_the_run() -> None:
-    play = Play(CHAIN, ways={"look": "hang"})
-    look = play.held.pop()
-    play.found = verdict(INTRUDER)
-    play.give(inputs.Verified(mark=look.mark, verdict=play.found))
-    assert play.levels == "3 3"
-    assert play.wait(1.0)[:1] == ["viewer disconnect"]
-    assert play.code == 4
-
-
 def test_what_changes_while_it_is_looked_at_is_looked_at_again() -> None:
     play = Play(CHAIN, ways={"look": "hang"})
     first = play.held.pop()
@@ -116,14 +104,6 @@ def test_a_node_that_is_not_as_it_was_verified_is_verified_again() -> None:
     again = play.held.pop()
     assert play.give(inputs.Verified(mark=again.mark, verdict=play.found)) == ["camera activate"]
     assert play.levels == "4"
-
-
-def test_networks_that_cannot_be_programmed_end_the_run_before_anything_is_activated() -> None:
-    play = Play(CHAIN, ways={"program": "no nft"})
-    play.wait(1.0)
-    assert not any(each.endswith(" activate") for each in play.said())
-    assert [each.rule for each in play.run.ending.failures] == ["run.not-programmed"]
-    assert play.code == 6
 
 
 def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
@@ -379,23 +359,6 @@ def test_an_order_waits_for_the_one_under_way_and_fits_then_or_not() -> None:
     assert [each[0] for each in play.answers.values()] == [ExitCode.OK, ExitCode.USAGE]
 
 
-MODES = (Mode(name="all", at=HERE), Mode(name="less", inactive=("camera",), at=HERE))
-
-
-def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate() -> None:
-    plan = replace(plan_of(planned_node("camera"), planned_node("viewer")), modes=MODES)
-    play = Play(plan)
-    play.see(INTRUDER)
-    assert play.order(ControlRequest.MODE, mode="less") == ["camera deactivate"]
-    play.order(ControlRequest.MODE, mode="all")
-    play.wait(1.0)
-    assert [each[0] for each in play.answers.values()] == [0, 4]
-    assert play.run.mode == "less"
-    play.see()
-    play.order(ControlRequest.MODE, mode="all")
-    assert play.levels == "4 4"
-
-
 @pytest.mark.parametrize(
     ("what", "asked"),
     [
@@ -472,25 +435,6 @@ def test_what_is_found_beside_all_looks_ends_the_run_and_is_said() -> None:
     assert (said.verdict, said.stage) == (found, Stage.CONNECTED)
     play.wait(30.0)
     assert play.code == ExitCode.VIOLATED
-
-
-def test_a_mode_whose_parameters_a_node_refuses_is_left_again_with_the_node_s_reason() -> None:
-    modes = Mode(name="day", at=HERE), Mode(name="night", at=HERE)
-    rates = [
-        ModeParameters(
-            mode=mode.name,
-            parameters=(ExpectedParameter(name="rate", type="integer", value=value, at=HERE),),
-        )
-        for mode, value in zip(modes, (10, 5), strict=True)
-    ]
-    camera = replace(planned_node("camera"), mode_parameters=tuple(rates))
-    play = Play(replace(plan_of(camera), modes=modes), ways={"give camera": "rate is read-only"})
-    play.order(ControlRequest.MODE, mode="night")
-    play.wait(5.0)
-    code, error = play.answers[0]
-    assert code == ExitCode.BRING_UP_FAILED
-    assert "cannot enter mode 'night': rate is read-only" in error
-    assert play.run.mode == "day"
 
 
 def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code() -> None:
