@@ -68,7 +68,8 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
-        self._noted: dict[str, tuple[int, float]] = {}  # number of a request, and its run delay
+        # Number of a request, and the run delays as it began.
+        self._noted: dict[str, tuple[int, tuple[float, ...]]] = {}
         self._found: set[str] = set()
 
     def ask(self, effect: effects.Ask) -> None:
@@ -83,8 +84,9 @@ class Requests:
         """Note the run delay of a step that takes long; to read it costs a file of each thread."""
         if node.core.request is request:
             # That it is read late is the machine's fault, too.
-            late_s = self._shell.now_s() - request.since_s - _slice_s(request)
-            self._noted[node.core.key] = request.number, node.run_delay_s() - max(0.0, late_s)
+            late_s = max(0.0, self._shell.now_s() - request.since_s - _slice_s(request))
+            delays_s = tuple(each - late_s for each in node.run_delays_s())
+            self._noted[node.core.key] = request.number, delays_s
 
     def tick(self, at_s: float) -> inputs.Tick:
         """Return a tick with what is known of late requests: time without a CPU does not count."""
@@ -94,10 +96,11 @@ class Requests:
             request, node = each.request, self._system.nodes[key]
             if request is None or at_s < late_at_s(request):
                 continue
-            number, noted_s = self._noted.get(key, (0, 0.0))
-            delay_s = node.run_delay_s() - noted_s if number == request.number else 0.0
-            # Threads that wait at once have waited no longer for it.
-            delay_s = max(0.0, min(delay_s, at_s - request.since_s))
+            number, noted_s = self._noted.get(key, (0, ()))
+            noted_s = noted_s if number == request.number else ()
+            waits_s = (now - then for now, then in zip(node.run_delays_s(), noted_s, strict=False))
+            # Those that wait at once have waited no longer for it.
+            delay_s = max(0.0, min(max(waits_s, default=0.0), at_s - request.since_s))
             left_s = late_at_s(replace(request, waited_s=delay_s)) - at_s
             if left_s >= _slice_s(request):
                 waited_s[key] = delay_s
