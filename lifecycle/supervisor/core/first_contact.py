@@ -40,12 +40,12 @@ def settle_first_contact(run: Run) -> list[Event]:
     passage, judged = run.asked, run.judged
     if passage is None or not passage.at_gate or run.opening is not None or run.failures:
         return []
-    if judged.verdict is None or gate.allows(run) or not gate.is_latest(run):
+    if judged.verdict is None or gate.allows(run):
         return []
     is_late = passage.until_s - run.now_s <= UNCHANGED_S or passage.tries.total() >= TRIES
     if is_late or advance.stage_of(run) is not Stage.CONNECTED:
         return []
-    if not run.is_past(judged.since_s + UNCHANGED_S):
+    if not gate.lasts_until(run, judged.since_s + UNCHANGED_S):
         return []
     name = undiscovered(judged.verdict, _restartable(run), passage.tries)
     node = None if name is None else run.node_named(name)

@@ -216,16 +216,12 @@ def see_violations(run: Run) -> None:
     found = {each.key: each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
     if is_ordered:  # what an order brings about is judged at its gate; a stranger it does not bring
         found = {key: each for key, each in found.items() if _is_strangers(run, each)}
-    keys = [*found]
-    if verdict.verdict is Outcome.VIOLATED and not found and not is_ordered:
-        keys = [("", verdict.verdict.value, "", None)]
-    judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
+    judged.violated = {key: judged.violated.get(key, run.now_s) for key in found}
     lasting = [key for key, at_s in judged.violated.items() if lasts_until(run, at_s + LASTS_S)]
     if lasting:
-        findings = tuple(found[key] for key in lasting if key in found)
-        text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
-        judged.counted = judged.counted or text
-    for key in keys:
+        findings = tuple(found[key] for key in lasting)
+        judged.counted = judged.counted or not_ok(replace(verdict, findings=findings))
+    for key in found:
         passes = key[0] != UNATTRIBUTED_ENDPOINT.id  # endpoints are known before whose they are
         if key in lasting or (passes and len(judged.passed) < _MOST):
             name = _named(key)
@@ -271,4 +267,4 @@ def passed(judged: Judged) -> str:
 
 
 def _named(key: FindingKey) -> str:
-    return f"{key[1]} ({key[0]})" if key[0] else key[1]
+    return f"{key[1]} ({key[0]})"

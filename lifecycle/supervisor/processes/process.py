@@ -185,10 +185,6 @@ class ManagedProcess:
         self.started_s = self._emit.elapsed_s
         self.child.exited.add_done_callback(self._exited)
 
-    def run_delay_s(self) -> float:
-        """Return its run delay and ours, seconds: ready to run, but without CPU."""
-        return own_run_delay_s() + (0.0 if self.child is None else self.child.run_delay_s())
-
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
         if self.child is not None:

@@ -436,20 +436,16 @@ async def _ask(
     """Ask a node for its state, its configuration and its parameters, all at once."""
     name = node.full_name
     return await asyncio.gather(
-        _or_none(clients.get_state(name, timeout_s=_ASK_S)) if node.managed else _nothing(),
+        _or_none(clients.get_state(name, timeout_s=_ASK_S) if node.managed else None),
         _or_none(clients.get_configuration(name, timeout_s=_ASK_S)),
-        _or_none(clients.get_parameters(name, timeout_s=_ASK_S)) if parameters else _nothing(),
+        _or_none(clients.get_parameters(name, timeout_s=_ASK_S) if parameters else None),
     )
 
 
-async def _or_none(asked: Awaitable[T]) -> T | None:
-    """Return an answer; None where there is none, which becomes a gap."""
+async def _or_none(asked: Awaitable[T] | None) -> T | None:
+    """Return an answer; None where nothing is asked or answered, which becomes a gap."""
     try:
-        return await asked
+        return None if asked is None else await asked
     except MiddlewareError as error:
         _logger.info("not told: %s", error)
         return None
-
-
-async def _nothing() -> None:
-    return None

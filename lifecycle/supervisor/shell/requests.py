@@ -23,7 +23,7 @@ from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
-from lifecycle.supervisor.core.state import REACHES, Level, Step
+from lifecycle.supervisor.core.state import NEVER_S, REACHES, Level, Request, Step
 from lifecycle.supervisor.nodes.adoption import ran_before
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
@@ -50,8 +50,7 @@ _DEATH_S = 0.5
 """A closed channel usually means a dying process; its end says more than the channel did."""
 
 _SLICE_S = 1.0
-"""A late step that has waited for a CPU gets that time; less than this, or a tenth of its limit, is
-not worth another look."""
+"""What is done within this, or a tenth of its limit, is not worth looking whether it had a CPU."""
 
 _REOPENS_S = 1.0
 """What changes as others are activated is judged within milliseconds, on a loaded machine later."""
@@ -69,15 +68,25 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
-        self._delay_s: dict[str, float] = {}
+        # Number of a request, and the run delays as it began.
+        self._noted: dict[str, tuple[int, tuple[float, ...]]] = {}
         self._found: set[str] = set()
 
     def ask(self, effect: effects.Ask) -> None:
         """Ask a node for a step."""
         node = self._system.nodes[effect.node]
-        self._delay_s[effect.node] = node.run_delay_s()
         task = self._shell.start(self._carry_out(node, effect))
         self._tasks[effect.node] = effect.number, task
+        if (request := node.core.request) is not None and request.limit_s < NEVER_S:
+            asyncio.get_running_loop().call_later(_slice_s(request), self._note, node, request)
+
+    def _note(self, node: NodeRun, request: Request) -> None:
+        """Note the run delay of a step that takes long; to read it costs a file of each thread."""
+        if node.core.request is request:
+            # That it is read late is the machine's fault, too.
+            late_s = max(0.0, self._shell.now_s() - request.since_s - _slice_s(request))
+            delays_s = tuple(each - late_s for each in node.run_delays_s())
+            self._noted[node.core.key] = request.number, delays_s
 
     def tick(self, at_s: float) -> inputs.Tick:
         """Return a tick with what is known of late requests: time without a CPU does not count."""
@@ -87,11 +96,13 @@ class Requests:
             request, node = each.request, self._system.nodes[key]
             if request is None or at_s < late_at_s(request):
                 continue
-            # Threads that wait at once have waited no longer for it.
-            delay_s = max(0.0, node.run_delay_s() - self._delay_s[key])
-            delay_s = min(delay_s, at_s - request.since_s)
+            number, noted_s = self._noted.get(key, (0, ()))
+            noted_s = noted_s if number == request.number else ()
+            waits_s = (now - then for now, then in zip(node.run_delays_s(), noted_s, strict=False))
+            # Those that wait at once have waited no longer for it.
+            delay_s = max(0.0, min(max(waits_s, default=0.0), at_s - request.since_s))
             left_s = late_at_s(replace(request, waited_s=delay_s)) - at_s
-            if left_s >= min(_SLICE_S, request.limit_s / 10):
+            if left_s >= _slice_s(request):
                 waited_s[key] = delay_s
             else:
                 where[key] = node.where()
@@ -315,6 +326,10 @@ class Requests:
             # Judged by what it has then, which names the parameter.
             self._system.emit(Notice(message=error.message))
         self._system.touch()
+
+
+def _slice_s(request: Request) -> float:
+    return min(_SLICE_S, request.limit_s / 10)
 
 
 def _applies(step: Step, node: NodeRun) -> bool:
