@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -43,7 +44,8 @@ _LOOK_S = 0.2
 def command(*, node: str | None, follow: bool, system: str, count: int | None) -> int:
     """Show what the processes of the latest run have written; of NODE, or of all.
 
-    NODE is a node, or a process of several; while its run lasts, --follow waits for its first line.
+    NODE is a process or a node: of one that shares its process, the lines of its logger. While its
+    run lasts, --follow waits for the first line.
     The files are in ROS_LOG_DIR, else ~/.ros/log, where `latest` leads to those of the run that
     began last.
     """
@@ -62,27 +64,58 @@ def command(*, node: str | None, follow: bool, system: str, count: int | None) -
     return ExitCode.OK
 
 
-def _files(run: Path, node: str | None) -> list[Path]:
+_RCL_LINE = re.compile(rb"(?:\x1b\[[\d;]*m)*\[[A-Z]+\] \[[\d.]+\] \[([^\]]+)\]: ")
+"""How rcutils writes a line of a logger, unless RCUTILS_CONSOLE_OUTPUT_FORMAT says otherwise."""
+
+
+def _files(run: Path, node: str | None) -> tuple[list[Path], str]:
+    """Return the files to show, and of which logger; empty for all of their lines."""
     files = sorted(run.glob("*.log"))
     if node is None:
-        return files
+        return files, ""
     wanted = node.strip("/").replace("/", ".")
-    found = [each for each in files if wanted in (each.stem, each.stem.rpartition(".")[2])]
-    if not found:
-        there = ", ".join(each.stem for each in files) or "none"
-        raise UsageError(
-            f"cannot find the log of {node!r} in {str(run)!r}; there are: {there}",
-            hint="a node that shares a process is in that process's log",
-        )
-    return found
+    found = [each for each in files if _is_of(each.stem, wanted)]
+    return (found, "") if found else (files, wanted)
+
+
+def _is_of(name: str, wanted: str) -> bool:
+    return wanted in (name, name.rpartition(".")[2])
+
+
+def _of(lines: Iterable[bytes], logger: str) -> Iterator[bytes]:
+    """Yield lines of a logger, or of its children."""
+    for line in lines:
+        found = _RCL_LINE.match(line) if logger else None
+        name = found[1].decode("utf-8", "replace") if found else ""
+        while name and not _is_of(name, logger):
+            name = name.rpartition(".")[0]
+        if name or not logger:
+            yield line
+
+
+def _missing(run: Path, node: str | None) -> UsageError:
+    there = ", ".join(each.stem for each in sorted(run.glob("*.log"))) or "none"
+    return UsageError(
+        f"cannot find the log of {node!r} in {str(run)!r}; there are: {there}",
+        hint="a node that shares a process is in that process's log",
+    )
 
 
 def _written(run: Path, node: str | None, count: int | None) -> Iterator[str]:
-    """Yield the lines that are there."""
-    files = _files(run, node)
+    """Yield the lines that are there.
+
+    Raises:
+        UsageError: there is none of the node.
+    """
+    files, logger = _files(run, node)
+    is_there = not logger
     for path in files:
         with path.open("rb") as file:
-            yield from _shown(path, collections.deque(file, count), several=len(files) > 1)
+            lines = collections.deque(_of(file, logger), count)
+        is_there |= bool(lines)
+        yield from _shown(path, lines, several=len(files) > 1 and not logger)
+    if not is_there and node is not None:
+        raise _missing(run, node)
 
 
 def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
@@ -94,27 +127,25 @@ def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
     from lifecycle.supervisor.processes.logs import is_running
 
     followed: dict[Path, BinaryIO] = {}
-    first = True
+    first, is_there = True, False
     while True:
         runs = is_running(run)
-        try:
-            files = _files(run, node)
-        except UsageError:
-            if not runs:
-                raise
-            files = []
-        if not files and not runs:
-            return
-        several = node is None or len(files) > 1
+        files, logger = _files(run, node)
+        several = node is None or (len(files) > 1 and not logger)
         for path in files:
             file = followed.get(path)
-            lines = [] if file is None else list(_whole_lines(file))
+            lines = [] if file is None else list(_of(_whole_lines(file), logger))
             if file is None or _is_another(file, path):  # it is new, or was rotated
                 file = followed[path] = path.open("rb")
-                new = _whole_lines(file)
+                new = _of(_whole_lines(file), logger)
                 lines += collections.deque(new, count) if first else new
+            is_there |= bool(lines)
             yield from _shown(path, lines, several=several)
         first = first and not files
+        if not runs and not (is_there if logger else files):
+            if node is not None:
+                raise _missing(run, node)
+            return
         time.sleep(_LOOK_S)
 
 

@@ -56,6 +56,17 @@ def test_a_node_is_found_by_its_full_name_and_a_system_by_its_own(root: Path) ->
     assert shown("/robot/talker", "--system", "arm-2-left") == ["arm"]
 
 
+def test_of_a_node_that_shares_a_process_the_lines_of_its_logger_are_shown(root: Path) -> None:
+    camera = "[INFO] [1.5] [robot.camera]: one"
+    lens = "[WARN] [1.6] [robot.camera.lens]: two"
+    battery = "[INFO] [1.7] [robot.battery]: three"
+    run(root, 1, sensors=f"{camera}\nprinted\n{lens}\n{battery}\n", lidar=f"{camera}x\n")
+    for name in ("/robot/camera", "camera", "robot.camera"):
+        assert shown(name) == [f"{camera}x", camera, lens]
+    assert shown("camera", "-n", "1") == [f"{camera}x", lens]
+    assert shown("battery") == [battery]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
