@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import inputs
+from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
@@ -442,6 +442,36 @@ def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate() -> None:
     play.see()
     play.order(ControlRequest.MODE, mode="all")
     assert play.levels == "4 4"
+
+
+class _Looked(Play):
+    """Notes whether nodes were on their way through the gate when the last look began."""
+
+    on_the_way = True
+
+    def _answer(self, effect: Any) -> Any:
+        if isinstance(effect, effects.Look):
+            self.on_the_way = self.run.passage is not None
+        return super()._answer(effect)
+
+
+def test_after_each_passage_it_is_looked_again_as_looks_on_the_way_measure_nothing() -> None:
+    nodes = (planned_node(each, supervision=AGAIN) for each in ("camera", "viewer"))
+    play = _Looked(replace(plan_of(*nodes), modes=MODES))
+    for ask, what in (
+        (ControlRequest.RESTART, {"node": "viewer"}),
+        (ControlRequest.PAUSE, {}),
+        (ControlRequest.RESUME, {}),
+        (ControlRequest.MODE, {"mode": "less"}),
+        (ControlRequest.MODE, {"mode": "all"}),
+    ):
+        play.on_the_way = ask is not ControlRequest.PAUSE
+        play.order(ask, **what)
+        assert (play.answers[len(play.answers) - 1], play.on_the_way) == ((0, ""), False), ask
+    play.on_the_way = True
+    play.die("viewer")
+    play.wait(2.0)
+    assert (play.levels, play.on_the_way) == ("4 4", False)
 
 
 def test_a_manifest_is_applied_and_one_whose_node_fails_is_taken_back() -> None:
