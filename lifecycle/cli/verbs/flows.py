@@ -296,9 +296,10 @@ def _show(
     if exported is not None:
         export(seen.plan, seen.verdict.flows, *exported)
     else:
-        verdict, colour = seen.verdict, sys.stdout.isatty()
-        measured = (*verdict.measured, *_supervised(plan))
-        click.echo(render_flows(verdict.flows, format_, measured, colour=colour))
+        measured, colour = _numbers(plan, seen.verdict), sys.stdout.isatty()
+        click.echo(render_flows(seen.verdict.flows, format_, measured, colour=colour))
+        if any(each.violated for each in measured):
+            return ExitCode.VIOLATED
     return exit_code(seen.verdict, strict=False)
 
 
@@ -306,18 +307,22 @@ def _measuring(plan: Plan) -> Path | None:
     """Return the run of the supervisor on this host that measures a system; None without one."""
     from lifecycle.supervisor.run.looking import supervisor_of
 
-    return supervisor_of(os.environ, plan, "") if plan.bounds else None
+    machine_of = {each.key: each.machine for each in plan.nodes}
+    takes = sorted({machine_of[each.subscription] for each in plan.flows}) if plan.bounds else []
+    found = (supervisor_of(os.environ, plan, each) for each in ("", *takes) if takes)
+    return next((each for each in found if each is not None), None)
 
 
-def _supervised(plan: Plan) -> Iterable[FlowMeasurement]:
-    """Return what this host's supervisor has measured: it knows the clocks of other hosts."""
+def _numbers(plan: Plan, verdict: Verdict) -> tuple[FlowMeasurement, ...]:
+    """Return what is measured: a supervisor knows how far the clocks of hosts are apart, too."""
     from lifecycle.supervisor.control.client import status
 
     path = _measuring(plan)
-    if path is not None:
-        with contextlib.suppress(TimeoutError, UsageError):  # it is busy, or ends
-            return status(path).measured
-    return ()
+    if path is None:
+        return verdict.measured
+    with contextlib.suppress(UsageError, TimeoutError):  # it ends, or is busy
+        return status(path).measured
+    return verdict.measured
 
 
 def _watch(plan: Plan, format_: str) -> int:

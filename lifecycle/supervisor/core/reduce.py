@@ -64,6 +64,7 @@ def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
 def _settle(run: Run) -> list[Event]:
     """Take what follows from the state alone one step further."""
     events: list[Event] = []
+    passage, was_held = run.passage, run.held_s is not None
     if run.ending is None and run.failures and _has_failed(run):
         events += failure.end_failed(run)
     _give_up_steps(run)
@@ -76,6 +77,8 @@ def _settle(run: Run) -> list[Event]:
         events += orders.settle_orders(run)
         events += consequences.settle_consequences(run)
         events += _hold(run)
+    if passage is not None and run.passage is None and was_held:
+        run.changed()  # a look that began on the way through the gate measures nothing
     return [*events, *_returned(run)]
 
 

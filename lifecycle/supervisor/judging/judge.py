@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
+from lifecycle.supervisor.nodes.driver import ACTIVE
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
 from lifecycle.verify.observation import Observation
@@ -75,6 +77,7 @@ class Judge:
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
         self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
+        self._active_far: dict[str, float] = {}  # nodes of other machines, and since when
         self._again: asyncio.TimerHandle | None = None
 
     @property
@@ -113,6 +116,7 @@ class Judge:
             observation = replace(
                 observation, clocks=self._peers.clocks(), marks=self._peers.marks()
             )
+        observation = self._with_far_activity(observation)
         self.seen = observation
         system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
@@ -139,6 +143,20 @@ class Judge:
         verdict = self._peers.explained(verdict)
         more = (*self._peers.findings(observation), *discovery_server.findings(system))
         return with_findings(verdict, more, expected.policy)
+
+    def _with_far_activity(self, observation: Observation) -> Observation:
+        """Return what was seen, with how long nodes of other machines are seen to be active."""
+        far = {each.full_name for each in self._system.remote.values()}
+        seen, now_s = observation.configurations, asyncio.get_running_loop().time()
+        active = [each.name for each in seen if each.name in far and each.state in ("", ACTIVE)]
+        self._active_far = {name: self._active_far.get(name, now_s) for name in active}
+        timed = (
+            replace(each, measured=Measured(active_s=now_s - self._active_far[each.name]))
+            if each.name in self._active_far
+            else each
+            for each in seen
+        )
+        return replace(observation, configurations=tuple(timed)) if active else observation
 
     def _asked(self) -> Plan:
         """Return the plan without silent nodes; the same object while that is the same."""

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RosArguments, RunKind
+from lifecycle.measure.sample import Measured
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
@@ -207,7 +208,12 @@ class NodeRun:
             # What it said of itself in another state is no answer; its host reports the new one.
             stale = known.health is not None and known.state != state
             health = _NOT_ANSWERED if stale else known.health
-            self.configuration = replace(known, state=state, connected=connected, health=health)
+            measured = known.measured
+            if self.is_hosted and known.state != state:
+                measured = Measured(active_s=0.0)  # what was counted before is over
+            self.configuration = replace(
+                known, state=state, connected=connected, health=health, measured=measured
+            )
         self.say()
 
     def say(self) -> None:

@@ -309,16 +309,9 @@ async def _change(observer_participant: ObserverParticipant, timeout_s: float) -
 
 
 def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> Path | None:
-    """Return the run directory of the supervisor of a plan on this host; None without one.
-
-    Args:
-        environment: says where run directories are.
-        plan: of the system.
-        machine: that it brings up; empty for whichever it is.
-    """
-    machines = (machine,) if machine else ("", *(each.name for each in plan.machines))
-    paths = (runtime_root(environment) / run_name(plan, each) for each in machines)
-    return next(filter(is_held, paths), None)
+    """Return the run directory of the supervisor of a plan on this host; None without one."""
+    path = runtime_root(environment) / run_name(plan, machine)
+    return path if is_held(path) else None
 
 
 def supervised_pictures(path: Path) -> Iterator[Picture]:

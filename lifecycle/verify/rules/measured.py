@@ -207,15 +207,13 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         if Kind.LOSS in kinds and self.sample is not None and self.sample.lost is None:
             yield "its RMW gives messages no publication sequence numbers"
 
-    def judgements(self, view: View) -> Iterator[tuple[Quantity, Bound, Judgement]]:
+    def judgements(self) -> Iterator[tuple[Quantity, Bound, Judgement]]:
         """Judge each of its numbers that can be measured, the same one only once."""
         if self.sample is None:
             return
-        publisher = self.flow.nodes[0]
-        report = publisher.configuration
+        report = self.flow.nodes[0].configuration
         measured = None if report is None else report.measured
-        near = brings_up(publisher.node, view.machines)
-        publishes_s = measured.active_s if measured is not None and near else None
+        publishes_s = None if measured is None else measured.active_s
         seen: set[Bound] = set()
         for quantity in (*self.own, *self.of_topic):
             if self.why_not(quantity):
@@ -294,7 +292,7 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
                 clock=clock if clock != SAME_CLOCK else None,
                 bounds=tuple(
                     _bound(quantity, bound, judgement)
-                    for quantity, bound, judgement in each.judgements(view)
+                    for quantity, bound, judgement in each.judgements()
                 ),
             )
         )
@@ -327,7 +325,7 @@ def _is_given_up(judgement: Judgement) -> bool:
 
 
 def _judged(view: View, each: _Counted) -> Iterator[Finding]:
-    for quantity, bound, judgement in each.judgements(view):
+    for quantity, bound, judgement in each.judgements():
         sample = each.sample
         assert sample is not None
         if judgement.kept is False:

@@ -124,6 +124,27 @@ def test_what_is_to_be_done_about_a_violated_number_is_done(
         assert (finding["rule"], finding["subject"]) == ("flow.silent", SUBJECT)
 
 
+def test_data_are_measured_anew_after_each_order_and_what_was_before_is_no_fault(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    modes = {"normal": {}, "quiet": {"inactive": ["source"]}}
+    kept = {"rate_hz": 60, "max_silence_s": 1.5}
+    manifest, fault = system(tmp_path, fresh_domain, bounds=kept, modes=modes)
+    orders = (("restart", "source"), ("mode", "quiet"), ("mode", "normal"), ("pause",), ("resume",))
+    with up(manifest, runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.until_verdict(lambda verdict: set(bounds_of(verdict).values()) == {"ok"})
+        for order, *what in orders:
+            done = verb(order, "system", *what, runtime=tmp_path)
+            assert done.returncode == ExitCode.OK, done.stderr
+            time.sleep(4.0)
+            for verdict in (each["verdict"] for each in run.of_kind("verdict")):
+                named = {each["rule"] for each in verdict["findings"]}
+                assert named.isdisjoint({"flow.rate", "flow.silent"}), (order, what)
+        fault.write_text("slow")
+        run.until_found("flow.rate", SUBJECT)
+
+
 def test_verify_measures_what_runs_already(tmp_path: Path, fresh_domain: int) -> None:
     manifest, fault = system(tmp_path, fresh_domain)
     with up(manifest, runtime=tmp_path) as run:

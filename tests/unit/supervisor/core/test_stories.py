@@ -13,12 +13,13 @@ from lifecycle.manifest.model import (
     BY_DEFAULT,
     Condition,
     Consequence,
+    Mode,
     OnFailure,
     Reaction,
     RunKind,
 )
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import inputs
+from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
@@ -357,6 +358,39 @@ def test_an_order_waits_for_the_one_under_way_and_fits_then_or_not() -> None:
     play.ways.clear()
     play.give(inputs.Replied(node="viewer", number=asked.number, level=Level.CONNECTED))
     assert [each[0] for each in play.answers.values()] == [ExitCode.OK, ExitCode.USAGE]
+
+
+MODES = (Mode(name="all", at=HERE), Mode(name="less", inactive=("camera",), at=HERE))
+
+
+class _Looked(Play):
+    """Notes whether nodes were on their way through the gate when the last look began."""
+
+    on_the_way = True
+
+    def _answer(self, effect: Any) -> Any:
+        if isinstance(effect, effects.Look):
+            self.on_the_way = self.run.passage is not None
+        return super()._answer(effect)
+
+
+def test_after_each_passage_it_is_looked_again_as_looks_on_the_way_measure_nothing() -> None:
+    nodes = (planned_node(each, supervision=AGAIN) for each in ("camera", "viewer"))
+    play = _Looked(replace(plan_of(*nodes), modes=MODES))
+    for ask, what in (
+        (ControlRequest.RESTART, {"node": "viewer"}),
+        (ControlRequest.PAUSE, {}),
+        (ControlRequest.RESUME, {}),
+        (ControlRequest.MODE, {"mode": "less"}),
+        (ControlRequest.MODE, {"mode": "all"}),
+    ):
+        play.on_the_way = ask is not ControlRequest.PAUSE
+        play.order(ask, **what)
+        assert (play.answers[len(play.answers) - 1], play.on_the_way) == ((0, ""), False), ask
+    play.on_the_way = True
+    play.die("viewer")
+    play.wait(2.0)
+    assert (play.levels, play.on_the_way) == ("4 4", False)
 
 
 @pytest.mark.parametrize(
