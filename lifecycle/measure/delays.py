@@ -49,9 +49,7 @@ def least_ns(bucket: int) -> int:
     """Return the shortest delay of a bucket."""
     if bucket < 0:
         return 1 - least_ns(1 - bucket)
-    if bucket < 2 * _PARTS:
-        return bucket
-    shift = (bucket >> _PART_BITS) - 1
+    shift = max((bucket >> _PART_BITS) - 1, 0)
     return (bucket - (shift << _PART_BITS)) << shift
 
 

@@ -186,6 +186,14 @@ def test_delays_across_clocks_are_exact_within_the_known_error(
         )
 
 
+def test_what_was_received_before_counting_began_does_not_count_by_another_clock() -> None:
+    for received_ns, messages in ((START + NS // 4, 0), (START + NS, 1), (0, 1)):
+        counter = Counter(0, START, is_apart=True)
+        names = ("source_timestamp", "received_timestamp", "publication_sequence_number")
+        counter.arrived(NS, START + NS, dict(zip(names, (7, received_ns, 1), strict=True)))
+        assert counter.sample(NS).messages == messages
+
+
 @pytest.mark.parametrize("ahead_ns", [500_000_000, -500_000_000, 10**5 * HOUR, -(10**5) * HOUR])
 def test_rate_and_loss_do_not_depend_on_the_other_clock(ahead_ns: int) -> None:
     sample = counted(steady(3.0), ahead_ns=ahead_ns, until_s=5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Endpoint,
@@ -14,7 +15,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import without_findings
+from lifecycle.verify.judge import with_findings, without_findings
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
 from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
@@ -59,6 +60,21 @@ def test_a_verdict_without_a_finding_is_as_if_it_had_not_been_made_its_flows_too
     nothing = without_findings(verdict, verdict.findings, plan.policy)
     assert (nothing.verdict, nothing.findings, nothing.blocking) == (Outcome.OK, (), False)
     assert {each.outcome for each in nothing.flows} == {Outcome.OK}
+
+
+def test_what_a_supervisor_finds_itself_comes_first_and_makes_a_verdict_no_better() -> None:
+    plan = plan_of()
+    good, bad = judged(plan), judged(plan, add_node("/spy"))
+    unsure = (replace(bad.findings[0], outcome=Outcome.UNVERIFIABLE),)
+    assert with_findings(good, (), plan.policy) is good
+    for verdict, found, outcome, blocks in (
+        (good, bad.findings, Outcome.VIOLATED, True),
+        (bad, unsure, Outcome.VIOLATED, True),
+        (good, unsure, Outcome.UNVERIFIABLE, False),
+    ):
+        added = with_findings(verdict, found, plan.policy)
+        assert (added.verdict, added.blocking) == (outcome, blocks)
+        assert added.findings == (*found, *verdict.findings)
 
 
 def test_undeclared_endpoints_of_nodes_that_may_have_such_are_listed_and_no_others() -> None:

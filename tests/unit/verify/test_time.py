@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ExpectedParameter, Plan
 from lifecycle.verify.observation import Observation, ParameterReport
-from lifecycle.verify.tool_filter import CLOCK
+from lifecycle.verify.tool_filter import CLOCK, DeclaredNames
 from lifecycle.verify.verdict import Stage
 from tests.builders import at, endpoint, node, planned, publisher
 from tests.unit.verify.edits import (
@@ -79,6 +79,7 @@ def test_who_publishes_the_clock_is_judged(
 def test_without_simulated_time_it_does_not_matter_who_publishes_it() -> None:
     verdict = verify(ALONE, plays(gid="1")(perfect(ALONE)), stage=Stage.CONNECTED)
     assert verdict.findings == ()
+    assert [DeclaredNames.of(each).simulated for each in (ALONE, simulated(ALONE))] == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from lifecycle.manifest.model import (
     Reaction,
     RunKind,
 )
+from lifecycle.plan.build import attached_to
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.reduce import take
@@ -146,6 +147,19 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     assert play.levels == "1"
     play.give(inputs.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
     assert play.levels == "4"
+
+
+def test_what_ran_before_is_attached_to_before_anything_is_begun() -> None:
+    plan = plan_of(planned_node("camera"), planned_node("viewer"), planned_node("far"))
+    play = Play(plan)
+    play.run = new_run(plan, Options(), own=frozenset({"camera", "viewer"}))
+    play.run.adopting = True
+    assert play.give(inputs.Tick()) == []
+    attached, names = attached_to(plan, {"viewer"}), frozenset({"/viewer"})
+    asked = play.give(inputs.Adopted(plan=attached, nodes=names))
+    assert [each for each in asked if each.startswith("spawn")] == ["spawn camera"]
+    assert (sorted(play.run.nodes), play.levels) == (["camera", "viewer"], "4 4")
+    assert (play.run.adopted, play.run.adopting) == (names, False)
 
 
 @pytest.mark.parametrize(("managed", "held"), [(True, "viewer configure"), (False, "spawn viewer")])
