@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import (
     NETWORKS,
@@ -92,6 +92,7 @@ def render_flows(
     nothing was.
     """
     found = {each.pair: each for each in measured}
+    flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
     if format_ == "json":
         documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
         return json_text(to_json(documents).decode())
@@ -156,7 +157,7 @@ def _rows(
         " / ".join(each.value for each in flow.requirement),
         flow.demanded.value,
         flow.effective_transport,
-        _outcome(flow, measured).value,
+        flow.outcome.value,
     )
     for each in _tuples(flow):
         pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))

@@ -53,11 +53,14 @@ def _together(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Itera
     rates = [each for each in _named("rate_hz", published) if each.most or each.value]
     if not rates:
         return
-    fastest = max(rates, key=_hertz)
+    fastest, least = max(rates, key=_hertz), max(rates, key=lambda each: each.value)
     where = f"the publisher declares {fastest} ({fastest.at.spelled})"
     for rate in _named("rate_hz", asked):
         if rate.value > _hertz(fastest):
             yield error(_RULE, rate.at, f"cannot ask for {rate}: {where}")
+        elif rate.most is not None and rate.most < least.value * (1 - least.slack):
+            message = f"cannot keep {rate}: the publisher declares {least} ({least.at.spelled})"
+            yield error(_RULE, rate.at, message)
     for silence in _named("max_silence_s", (*published, *asked)):
         period_s = 1 / _hertz(fastest)
         if silence.value < period_s:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
+from lifecycle.errors import LifecycleError
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.sample import Measured, Sample
 
@@ -60,8 +61,8 @@ class NodeGate:
     def add(self, entity: object, gated: Gated) -> None:
         """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
-        if isinstance(gated, CountedSubscription):
-            gated.counts = self._counts
+        if isinstance(gated, CountedSubscription) and not self._counts:
+            gated.count_nothing()
         if self._is_open:
             self._open(gated)
         else:
@@ -77,11 +78,15 @@ class NodeGate:
         self._workers.pop(id(entity), None)
 
     def count_nothing(self) -> None:
-        """Leave callbacks as they are: `executor: events` gives them no message info."""
+        """Leave callbacks as they are: `executor: events` gives them no message info.
+
+        Raises:
+            LifecycleError: one takes it.
+        """
         self._counts = False
         for gated in tuple(self._entities.values()):
             if isinstance(gated, CountedSubscription):
-                gated.counts = False
+                gated.count_nothing()
                 (gated.open if self._is_open else gated.close)()
 
     def measure(self, apart: Collection[str]) -> None:
@@ -189,6 +194,19 @@ class CountedSubscription:
         self._is_open = False
         self._counter = None
         self._subscription.callback = self._call if self.counts else self._users
+
+    def count_nothing(self) -> None:
+        """Leave the callback as it is.
+
+        Raises:
+            LifecycleError: it takes message info, which rclpy's events executor has not.
+        """
+        if not _takes_one(self._users):
+            raise LifecycleError(
+                f"cannot give the callback of {self.topic!r} message info with 'executor: events'",
+                hint="have it take the message alone, or choose another executor",
+            )
+        self.counts = False
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""

@@ -25,7 +25,7 @@ from lifecycle.verify.observation import ArrivedMark
 from lifecycle.verify.verdict import FlowReport
 
 OVERDUE_S = 6.0
-"""One is sent each second, once a flow is verified on both hosts."""
+"""One arrives each second, once a flow is verified on both hosts."""
 
 Ports = tuple[int, int]
 """Where a supervisor receives marks, over IPv4 and IPv6; 0 where it does not."""
@@ -96,7 +96,7 @@ class Marks:
         self._sockets: dict[int, socket.socket] = {}
         self._to: set[_Way] = set()
         self._from: dict[_Way, float] = {}
-        self._arrived: dict[_Way, int] = {}
+        self._arrived: dict[_Way, tuple[int, float]] = {}
 
     @property
     def own_ports(self) -> Ports:
@@ -169,12 +169,12 @@ class Marks:
         """Return with what mark those arrive that must: what does not keep it, if several do."""
         found: dict[tuple[str, int], int | None] = {}
         for way, since_s in self._from.items():
-            key, mark = (way.machine, way.dscp), self._arrived.get(way)
-            if mark is not None:
-                if found.get(key) in (None, way.dscp):
-                    found[key] = mark
-            elif self._loop.time() > since_s + OVERDUE_S:
+            key = (way.machine, way.dscp)
+            mark, last_s = self._arrived.get(way, (None, since_s))
+            if self._loop.time() > last_s + OVERDUE_S:
                 found.setdefault(key, None)
+            elif mark is not None and found.get(key) in (None, way.dscp):
+                found[key] = mark
         return tuple(
             ArrivedMark(machine=machine, dscp=dscp, arrives_as=mark)
             for (machine, dscp), mark in sorted(found.items())
@@ -196,7 +196,7 @@ class Marks:
             for machine in self.machines.get(mark.run, ()):
                 way = _Way(machine, mark.dscp, mark.to)
                 if way in self._from:
-                    self._arrived[way] = value >> _ECN_BITS
+                    self._arrived[way] = (value >> _ECN_BITS, self._loop.time())
 
 
 def _classes(controls: Iterable[tuple[int, int, bytes]]) -> Iterator[int]:

@@ -11,6 +11,7 @@ A 5QI stands for its packet delay budget, which 98 % of the packets keep, and it
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import msgspec
@@ -372,9 +373,10 @@ def _counted(view: View) -> list[_Counted]:
     for flow in view.flows:
         arriving.setdefault((flow.planned.topic, flow.subscription), []).append(flow)
     found = []
-    for flows in arriving.values():
+    seen = (*view.seen, *view.seen_of_tools)
+    publishers = Counter(each.name for each in seen if each.kind is EndpointKind.PUBLISHER)
+    for (topic, _), flows in arriving.items():
         planned = sum(len(each.publishers) or 1 for each in flows)
-        matched = [each.report.matched or 0 for each in flows[0].subscriptions if each.report]
         of_topic = (each for one in flows[0].subscriptions for each in one.planned.quantities)
         numbers = tuple(of_topic)
         sample = _sample(view, flows[0])
@@ -385,7 +387,7 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max((planned, *matched)),
+                several=max(planned, publishers[topic]),
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
                 own=(*flow.planned.quantities, *published),

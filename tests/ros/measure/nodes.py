@@ -58,6 +58,14 @@ class Sink(LifecycleNode):
             time.sleep(0.05)
 
 
+class Informed(LifecycleNode):
+    """Takes the message info, too."""
+
+    @on_message("numbers")
+    def take(self, message: UInt64, info: dict[str, int]) -> None:
+        pass
+
+
 class PlainSink(rclpy.node.Node):
     """Likewise, a node that knows nothing of a lifecycle."""
 

@@ -99,6 +99,17 @@ def test_each_fault_of_a_running_system_is_found_and_each_recovery(
         assert run.finish() == ExitCode.OK
 
 
+def test_a_callback_that_takes_message_info_is_refused_with_the_events_executor(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    informed = {"run": {"python": f"{NODES}:Informed", "executor": "events"}}
+    manifest, _ = system(tmp_path, fresh_domain, sink=informed)
+    with up(manifest, runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        (failed, *_) = run.of_kind("failure")
+        assert "cannot give the callback of '/numbers' message info" in failed["message"]
+
+
 def test_a_violated_number_takes_a_strict_system_back_to_inactive(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -114,10 +114,13 @@ async def test_what_does_not_arrive_is_overdue_after_a_while(
         two.robot.ports = {"desk": (0, 0)}  # it does not say where it receives
         two.follow(flow("127.0.0.1"))
         assert await two.arrive() == ()
-        monkeypatch.setattr(module, "OVERDUE_S", 0.01)
-        assert await two.arrive() == arrived(None)
+        with monkeypatch.context() as patched:
+            patched.setattr(module, "OVERDUE_S", 0.01)
+            assert await two.arrive() == arrived(None)
         two.robot.ports = {"desk": two.desk.own_ports}
         assert await two.arrive() == arrived(EF)
+        monkeypatch.setattr(module, "OVERDUE_S", 0.01)  # they arrive no more
+        assert two.desk.arrived() == arrived(None)
 
 
 @pytest.mark.parametrize(

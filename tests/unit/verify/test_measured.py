@@ -15,7 +15,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import at, link, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import both, change_configuration, change_report
+from tests.unit.verify.edits import both, change_configuration
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -202,7 +202,9 @@ def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
     topic_rate = number("rate_hz", 15, 30, slack=0.05)
     plan = pair(rate, subscribed=(topic_rate, loss, number("max_delay_ms", 5)))
     sample = arrived(300, 10)
-    seen = change_report(SUB, "/a", matched=2)(perfect(plan, Stage.ACTIVE))
+    seen = perfect(plan, Stage.ACTIVE)
+    (own,) = (each for each in seen.endpoints if (each.kind, each.name) == (PUB, "/a"))
+    seen = replace(seen, endpoints=(*seen.endpoints, replace(own, node="/other", gid="0f")))
     counted = Measured(active_s=10, samples=(("/a", sample),))
     verdict = verify(plan, change_configuration("/two", measured=counted)(seen), stage=Stage.ACTIVE)
     named = [(each.subject, each.expected) for each in of_data(verdict)]
