@@ -80,17 +80,6 @@ def test_what_can_come_next_is_offered_and_nothing_is_run(
     assert not (place / "ran").exists()
 
 
-def test_click_prints_the_script_that_switches_it_on() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", "from lifecycle.cli import program; program()"],
-        env={**os.environ, "_LIFECYCLE_COMPLETE": "bash_source"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "_LIFECYCLE_COMPLETE=bash_complete" in done.stdout
-
-
 @pytest.mark.parametrize("name", VERBS)
 def test_the_help_of_a_verb_ends_with_an_example_that_the_verb_takes(name: str) -> None:
     context = click.Context(cli)

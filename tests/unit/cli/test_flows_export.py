@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,8 @@ from click.testing import CliRunner
 from lifecycle.cli.common import NETWORKS
 from lifecycle.cli.verbs import flows as verb
 from lifecycle.cli.verbs import up
-from lifecycle.errors import UsageError
 from lifecycle.programming.programmer import read_treatment
-from lifecycle.programming.target import TARGETS, read_targets
+from lifecycle.programming.target import read_targets
 from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import camara_settings, nef_settings, settings_file
@@ -46,52 +44,6 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(
     assert "EF = DSCP 46 = TOS 184 (0xb8)" in text
 
 
-def test_verified_flows_are_exported_as_nft_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
-    export("nft")
-
-    assert "table inet flowqos_" in capsys.readouterr().out
-
-
-def test_a_device_comes_from_its_option(capsys: pytest.CaptureFixture[str]) -> None:
-    export("tc", device="e0", rate="20mbit")
-
-    assert " dev e0 " in capsys.readouterr().out
-
-
-def test_bodies_take_the_settings_of_their_server(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = settings_file(tmp_path, nef=nef_settings("https://nef.test", devices=["10.77.0.1"]))
-
-    export("nef", config=file)
-
-    (subscription,) = json.loads(capsys.readouterr().out)["subscriptions"]
-    assert subscription["body"]["ueIpv4Addr"] == "10.77.0.1"
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        (
-            "tc",
-            (
-                "cannot program tc without a device; only devices that are named are touched; "
-                "give --device eth0 --rate 20mbit"
-            ),
-        ),
-        (
-            "nef",
-            ("cannot program nef without settings: where it is and who we are; give --config FILE"),
-        ),
-    ],
-)
-def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        export(name)
-
-    assert str(caught.value) == message
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -120,13 +72,6 @@ def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str)
     [
         (["--device", "e0"], "cannot use --device, --rate or --guarantee without --program tc"),
         (["--flow-labels"], "cannot use --dscp-from-5qi or --flow-labels without --program"),
-        (
-            ["--program", "tc"],
-            (
-                "cannot program tc without a device; only devices that are named are touched; "
-                "give --device eth0 --rate 20mbit"
-            ),
-        ),
     ],
 )
 def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
@@ -135,7 +80,3 @@ def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) ->
     result = CliRunner().invoke(up.command, [str(manifest), *options])
 
     assert str(result.exception) == message
-
-
-def test_networks_have_the_names_of_what_programs_them() -> None:
-    assert NETWORKS == TARGETS

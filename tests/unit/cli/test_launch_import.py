@@ -88,8 +88,12 @@ sys.exit(service.run())
 
 
 def _lifecycle(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return _python(folder, "-m", "lifecycle.cli", *words)
+
+
+def _python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "lifecycle.cli", *words],
+        [sys.executable, *words],
         cwd=folder,
         env=os.environ,
         capture_output=True,
@@ -160,17 +164,7 @@ def test_a_launch_file_starts_a_manifest(tmp_path: Path) -> None:
         '<lifecycle_manifest manifest="a.lifecycle.yaml"><arg name="rate" value="$(var rate)"/>'
         "</lifecycle_manifest></launch>"
     )
-    result = subprocess.run(
-        [
-            *(sys.executable, "-c"),
-            START,
-        ],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    result = _python(tmp_path, "-c", START)
     output = result.stdout + result.stderr
     assert "lifecycle.cli up a.lifecycle.yaml rate:=5" in output or "exit code 3" in output, output
     assert "a.lifecycle.yaml:1:1: cannot open 'a.lifecycle.yaml'" in output
@@ -178,17 +172,8 @@ def test_a_launch_file_starts_a_manifest(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not _is_installed("ros2cli"), reason="ros2cli is not installed")
 def test_ros2_manifest_is_lifecycle(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [
-            *(sys.executable, "-c", "from ros2cli.cli import main; raise SystemExit(main())"),
-            *("manifest", "check", "none.lifecycle.yaml"),
-        ],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    program = "from ros2cli.cli import main; raise SystemExit(main())"
+    result = _python(tmp_path, "-c", program, "manifest", "check", "none.lifecycle.yaml")
     assert result.returncode == 3, result.stderr
     assert "none.lifecycle.yaml:1:1: cannot open" in result.stdout
 

@@ -36,26 +36,24 @@ _IMPORTS = """
 """
 
 
-@pytest.mark.parametrize("code", [_MAKES_A_CLASS, _IMPORTS], ids=["a class", "an import"])
-def test_an_interrupt_that_python_raises_something_else_for_is_no_bug(code: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _INTERRUPTED_WHILE.format(code), "graph", "interrupted"],
+def ended(code: str, how: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED_WHILE.format(code), "graph", how],
         capture_output=True,
         text=True,
         timeout=30,
         check=False,
     )
+
+
+@pytest.mark.parametrize("code", [_MAKES_A_CLASS, _IMPORTS], ids=["a class", "an import"])
+def test_an_interrupt_that_python_raises_something_else_for_is_no_bug(code: str) -> None:
+    done = ended(code, "interrupted")
     assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
 
 
 def test_an_error_without_an_interrupt_is_reported_as_a_bug() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _INTERRUPTED_WHILE.format("pass"), "graph", "fails"],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = ended("pass", "fails")
     assert done.returncode == ExitCode.INTERNAL
     assert "ZeroDivisionError" in done.stderr
     assert "this is a bug in lifecycle" in done.stderr

@@ -96,18 +96,6 @@ def test_the_oldest_events_go_where_there_are_more_than_anybody_could_want() -> 
     os.close(read)
 
 
-def test_a_reader_that_goes_away_is_said_once_and_nothing_waits_for_him() -> None:
-    read, write = os.pipe()
-    os.close(read)
-    told: list[str] = []
-    writer = Writer(write, "standard output", marker=str, say=told.append)
-    for _ in range(3):
-        writer.put("hello\n")
-    writer.close()
-    os.close(write)
-    assert told == ["standard output was closed by its reader; the run goes on without it"]
-
-
 def test_a_disk_that_is_full_for_a_while_loses_and_counts_what_came_meanwhile(
     tmp_path: Path,
 ) -> None:
@@ -133,19 +121,3 @@ def test_a_disk_that_is_full_for_a_while_loses_and_counts_what_came_meanwhile(
     assert len(told) == 1
     for each in (file, full, there):
         os.close(each)
-
-
-def test_standard_error_that_nobody_reads_blocks_neither_us_nor_a_library() -> None:
-    program = (
-        "import os, sys\n"
-        "from lifecycle.cli.standard_streams import own_streams\n"
-        "streams = own_streams(waits=False)\n"
-        "for _ in range(1000):\n"
-        "    sys.stderr.write('x' * 1000 + '\\n')\n"
-        "try:\n"
-        "    while os.write(2, b'as C++ does' * 100): pass\n"
-        "except BlockingIOError:\n"
-        "    raise SystemExit(streams.settled(4)) from None\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.PIPE) as run:
-        assert run.wait(BOUND_S) == 4

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -100,13 +98,6 @@ def test_a_verb_that_is_misspelt_is_named_with_the_one_that_is_meant(
     assert capsys.readouterr().err == "cannot find the verb 'chekc'; did you mean 'check'?\n"
     assert main(["zzz"]) == 2
     assert "lifecycle --help lists the verbs" in capsys.readouterr().err
-
-
-def test_the_package_is_a_program() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "lifecycle", "--version"], capture_output=True, text=True, check=True
-    )
-    assert "version" in done.stdout
 
 
 def test_an_annotation_is_one_line_whatever_is_in_it() -> None:

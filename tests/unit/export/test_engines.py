@@ -17,7 +17,6 @@ from click.testing import CliRunner
 from lifecycle.cli import cli
 from lifecycle.errors import UsageError
 from lifecycle.export.engines import ENGINES, Deployment
-from lifecycle.manifest.model import Restart, Supervision
 from lifecycle.plan.model import Plan
 from tests.builders import plan_of, planned_node
 
@@ -38,11 +37,6 @@ def written(engine: str, **fields: Any) -> str:
         )
     ).values()
     return text
-
-
-def restarting(*, restarts: bool) -> Plan:
-    restart = Restart.ON_FAILURE if restarts else Restart.NO
-    return plan_of(planned_node("camera", supervision=Supervision(restart=restart)))
 
 
 def exported(tmp_path: Path, *words: str) -> dict[str, str]:
@@ -94,10 +88,8 @@ def test_words_with_signs_of_systemd_stand_for_themselves() -> None:
     )
 
 
-@pytest.mark.parametrize("restarts", [False, True])
-def test_kubernetes_takes_its_objects(*, restarts: bool) -> None:
-    plan = restarting(restarts=restarts)
-    made = yaml.safe_load(written("kubernetes", plan=plan, words=("a:=$(b)",)))
+def test_kubernetes_takes_its_objects() -> None:
+    made = yaml.safe_load(written("kubernetes", words=("a:=$(b)",)))
     kubernetes_validate.validate(made, "1.30", strict=True)
     assert made["kind"] == "Deployment"  # which starts a killed supervisor again, and no node
     (container,) = made["spec"]["template"]["spec"]["containers"]
@@ -121,12 +113,6 @@ def test_machines_of_kubernetes_are_its_nodes(tmp_path: Path) -> None:
         assert pod["hostIPC"]
 
 
-@pytest.mark.parametrize(("restarts", "unit"), [(False, "on-failure"), (True, "on-abnormal")])
-def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str) -> None:
-    plan = restarting(restarts=restarts)
-    assert sections(written("systemd", plan=plan))["Service"]["Restart"] == unit
-
-
 LIMITED = """
 manifest_version: 1
 system: limited
@@ -140,14 +126,6 @@ nodes:
   eye: {run: {command: [eye]}, machine: here}
   hand: {run: {command: [hand]}, machine: there}
 """
-
-
-def test_a_unit_delegates_nothing_as_processes_are_limited_in_scopes(tmp_path: Path) -> None:
-    manifest = tmp_path / "limited.lifecycle.yaml"
-    manifest.write_text(LIMITED)
-    files = exported(tmp_path / "out", "systemd", str(manifest))
-    for text in files.values():
-        assert "Delegate" not in sections(text)["Service"]
 
 
 def test_a_container_in_which_nothing_limits_processes_is_refused(tmp_path: Path) -> None:

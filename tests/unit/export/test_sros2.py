@@ -88,19 +88,6 @@ def test_the_policy_has_the_form_that_its_readers_demand(path: Path) -> None:
     assert complaints(policy_of(plan_of(path))) == []
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        '<policy version="0.1.0"><enclaves/></policy>',
-        '<policy version="0.2.0"><enclave path="/a"/></policy>',
-        '<topics publish="YES"><topic>a</topic></topics>',
-        '<topics reply="ALLOW"><topic>a</topic></topics>',
-    ],
-)
-def test_the_form_is_told_from_others(text: str) -> None:
-    assert complaints(ET.fromstring(text))
-
-
 NODES = """
 discovery: {domain_id: 7}
 nodes:

@@ -14,7 +14,7 @@ from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration
 from tests.unit.supervisor.fakes import run
 
 
-def world(*, unplanned: bool) -> tuple[FakeGraph, FakeClients, Observer]:
+def world() -> tuple[FakeGraph, FakeClients, Observer]:
     graph, clients = FakeGraph(), FakeClients()
     graph.nodes = (
         ObservedNode(full_name="/guest", managed=True),
@@ -25,12 +25,12 @@ def world(*, unplanned: bool) -> tuple[FakeGraph, FakeClients, Observer]:
         "/guest": replace(configuration("/guest"), checksum="1"),
         "/plain": configuration("/plain"),
     }
-    return graph, clients, observing(graph, clients, unplanned=unplanned)
+    return graph, clients, observing(graph, clients, unplanned=True)
 
 
 def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
     async def main() -> None:
-        graph, clients, observer = world(unplanned=True)
+        graph, clients, observer = world()
         seen = await observer.observe(plan())
         assert [each.name for each in seen.configurations] == ["/guest"]
         assert {each.full_name: each.state for each in seen.nodes}["/guest"] == "inactive"
@@ -44,18 +44,9 @@ def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
     run(main())
 
 
-def test_without_guests_only_planned_nodes_are_read() -> None:
-    async def main() -> None:
-        _, clients, observer = world(unplanned=False)
-        assert (await observer.observe(plan())).configurations == ()
-        assert clients.followed == {}
-
-    run(main())
-
-
 def test_a_status_is_worth_a_look_unless_it_says_what_is_known() -> None:
     async def main() -> None:
-        _, _, observer = world(unplanned=True)
+        _, _, observer = world()
         woken = observer.changes
 
         async def wakes(node: str, **fields: Any) -> bool:

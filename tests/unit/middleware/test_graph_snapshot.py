@@ -14,7 +14,6 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.rcl import graph
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.verify.observation import ObservedNode
 from lifecycle.verify.tool_filter import DeclaredNames
 
 STRING = "std_msgs::msg::dds_::String_"
@@ -128,14 +127,6 @@ def talker(name: bytes, topic: bytes = b"rt/chatter", prefix: str = ONE) -> End:
 def seen(observer: GraphObserver) -> list[tuple[str, str, str]]:
     names = DeclaredNames(names=frozenset({(EndpointKind.PUBLISHER, "/chatter")}))
     return [(each.node, each.name, each.type) for each in observer.snapshot(names=names)[1]]
-
-
-def test_a_node_is_there_while_an_endpoint_is_its_own(look: Look) -> None:
-    shown = Graph([node("one"), node("twin"), node("twin")], names=["one", "twin", "twin", "gone"])
-    assert look(shown).snapshot()[0] == (
-        ObservedNode(full_name="/one", managed=False),
-        ObservedNode(full_name="/twin", count=2, managed=False),
-    )
 
 
 def test_a_node_of_an_ended_process_is_nobody_while_discovery_shows_it(look: Look) -> None:

@@ -58,18 +58,6 @@ def texts(root: ET.Element, path: str) -> list[str]:
     return [(each.text or "").strip() for each in root.findall(path)]
 
 
-def test_transports_are_all_that_the_participant_has() -> None:
-    root = made(ParticipantSettings(transports=("udpv4", "udpv6")))
-    descriptors = root.findall(".//transport_descriptor")
-    assert [each.findtext("type") for each in descriptors] == ["UDPv4", "UDPv6"]
-    ids = [each.findtext("transport_id") for each in descriptors]
-    assert texts(root, ".//userTransports/transport_id") == ids == ["p_udpv4", "p_udpv6"]
-    assert texts(root, ".//useBuiltinTransports") == ["false"]
-    participant = root.find(".//participant")
-    assert participant is not None
-    assert participant.attrib == {"profile_name": "p"}, "it must never become the default"
-
-
 def test_non_blocking_send_is_set_on_udp_and_keeps_shared_memory_where_none_is_chosen() -> None:
     root = made(ParticipantSettings(non_blocking_send=True))
     found = [
@@ -77,13 +65,6 @@ def test_non_blocking_send_is_set_on_udp_and_keeps_shared_memory_where_none_is_c
         for each in root.findall(".//transport_descriptor")
     ]
     assert found == [("SHM", None), ("UDPv4", "true")]
-
-
-def test_the_datagram_size_limits_what_is_sent_and_not_the_receive_buffer() -> None:
-    root = made(ParticipantSettings(transports=("udpv4",), max_datagram_bytes=1400))
-    assert texts(root, ".//property/name") == ["fastdds.max_message_size"]
-    assert texts(root, ".//property/value") == ["1400"]
-    assert texts(root, ".//maxMessageSize") == []
 
 
 def test_a_datagram_size_alone_leaves_transports_alone() -> None:

@@ -110,6 +110,16 @@ def test_it_is_one_participant_of_its_own_that_soon_leaves_by_a_message(
         peer.recv(65536)
 
 
+def profile(tmp_path: Path, element: str) -> dict[str, str]:
+    """Return the environment of a user whose default profile has an element."""
+    file = tmp_path / "profile.xml"
+    file.write_text(
+        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
+        <rtps>{element}</rtps></participant></profiles></dds>"""
+    )
+    return {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}
+
+
 _SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 
 
@@ -199,12 +209,7 @@ def test_where_the_user_chose_how_others_are_found_nobody_is_asked(
 def test_a_profile_of_the_users_is_read_for_where_others_are_looked_for(
     tmp_path: Path, element: str, chosen: bool
 ) -> None:
-    file = tmp_path / "profile.xml"
-    file.write_text(
-        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
-        <rtps>{element}</rtps></participant></profiles></dds>"""
-    )
-    assert chosen_otherwise({"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}) is chosen
+    assert chosen_otherwise(profile(tmp_path, element)) is chosen
 
 
 @pytest.mark.parametrize(
@@ -213,13 +218,10 @@ def test_a_profile_of_the_users_is_read_for_where_others_are_looked_for(
 def test_a_profile_of_the_users_is_read_for_a_discovery_server(
     tmp_path: Path, protocol: str, *, served: bool
 ) -> None:
-    file = tmp_path / "profile.xml"
-    file.write_text(
-        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true"><rtps>
-        <builtin><discovery_config><discoveryProtocol>{protocol}</discoveryProtocol>
-        </discovery_config></builtin></rtps></participant></profiles></dds>"""
+    chosen = f"<discoveryProtocol>{protocol}</discoveryProtocol>"
+    environment = profile(
+        tmp_path, f"<builtin><discovery_config>{chosen}</discovery_config></builtin>"
     )
-    environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}
     assert is_served((), environment) is served
     assert not is_served((parse("shm://"),), environment)
 
@@ -234,13 +236,8 @@ def test_a_profile_of_the_users_is_read_for_a_discovery_server(
 def test_where_participants_connect_first_an_answer_is_not_enough(
     tmp_path: Path, element: str, *, connects: bool
 ) -> None:
-    file = tmp_path / "profile.xml"
-    file.write_text(
-        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
-        <rtps>{element}</rtps></participant></profiles></dds>"""
-    )
     near = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    asked = reach(25, (), {**near, "FASTRTPS_DEFAULT_PROFILES_FILE": str(file)})
+    asked = reach(25, (), {**near, **profile(tmp_path, element)})
     assert bool(asked) is not (connects or "builtinTransports" in element)
     large = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
     assert reach(25, (), large) == ()

@@ -70,12 +70,6 @@ def test_only_fast_dds_files_are_left_over(directory: Path) -> None:
     assert names(directory) == tuple(sorted(others))
 
 
-def test_leftovers_removes_nothing(directory: Path) -> None:
-    make(directory, *GROUP)
-    assert leftovers() == tuple(sorted(GROUP))
-    assert names(directory) == tuple(sorted(GROUP))
-
-
 def test_a_mapped_file_of_a_port_keeps_its_whole_group(directory: Path) -> None:
     make(directory, *GROUP, SEGMENT)
     with mapped(directory / PORT):

@@ -50,13 +50,6 @@ def test_a_bound_socket_is_listed_with_its_address_until_it_is_closed(
     assert found.inode not in {s.inode for s in open_sockets()}
 
 
-def test_a_tcp_connection_is_no_listening_socket() -> None:
-    with bound(*_TCP4) as listening, socket.create_connection(listening.getsockname()) as dialled:
-        ports = {s.port for s in open_sockets() if s.kind == "tcpv4"}
-        assert listening.getsockname()[1] in ports
-        assert dialled.getsockname()[1] not in ports
-
-
 @pytest.mark.parametrize(
     ("option", "what"),
     [

@@ -43,41 +43,24 @@ def test_the_table_says_of_each_endpoint_what_matching_needs() -> None:
         )
     )
     assert root.tag == "staticdiscovery"
-    told = [
-        (each.findtext("name"), [(end.tag, {v.tag: v.text for v in end}) for end in each[1:]])
+    told = {
+        each.findtext("name"): [(end.tag, {v.tag: v.text for v in end}) for end in each[1:]]
         for each in root
-    ]
+    }
     common = {"topicName": "rt/x", "topicDataType": _STRING, "topicKind": "NO_KEY"}
-    assert told == [
-        (
-            "/a",
-            [
-                (
-                    "writer",
-                    {
-                        "userId": "1",
-                        **common,
-                        "reliabilityQos": "RELIABLE_RELIABILITY_QOS",
-                        "durabilityQos": "TRANSIENT_LOCAL_DURABILITY_QOS",
-                    },
-                )
-            ],
-        ),
-        (
-            "/b",
-            [
-                (
-                    "reader",
-                    {
-                        "userId": "32767",
-                        **common,
-                        "reliabilityQos": "BEST_EFFORT_RELIABILITY_QOS",
-                        "durabilityQos": "VOLATILE_DURABILITY_QOS",
-                    },
-                )
-            ],
-        ),
-    ]
+    one = {
+        "userId": "1",
+        **common,
+        "reliabilityQos": "RELIABLE_RELIABILITY_QOS",
+        "durabilityQos": "TRANSIENT_LOCAL_DURABILITY_QOS",
+    }
+    other = {
+        "userId": "32767",
+        **common,
+        "reliabilityQos": "BEST_EFFORT_RELIABILITY_QOS",
+        "durabilityQos": "VOLATILE_DURABILITY_QOS",
+    }
+    assert told == {"/a": [("writer", one)], "/b": [("reader", other)]}
 
 
 def test_profiles_are_named_as_rmw_looks_for_them_and_give_the_id() -> None:

@@ -7,7 +7,6 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
 from lifecycle.plan.model import ParticipantConnections
 
@@ -26,40 +25,6 @@ def locators(root: ET.Element, path: str) -> list[dict[str, str]]:
     ]
 
 
-def test_fixed_ports_fix_everything_and_forbid_other_ports() -> None:
-    root = made(
-        "udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999"
-        "&peer=10.77.0.2:7910&multicast=off"
-    )
-    at = {"kind": "udpv4", "address": "10.77.0.1"}
-    assert locators(root, "defaultUnicastLocatorList") == [{**at, "port": "7911"}]
-    assert locators(root, "metatrafficUnicastLocatorList") == [{**at, "port": "7910"}]
-    assert locators(root, "metatrafficMulticastLocatorList") == []
-    peer = {"kind": "udpv4", "address": "10.77.0.2", "port": "7910"}
-    assert locators(root, "initialPeersList") == [peer]
-    said = ("avoid_builtin_multicast", "mutation_tries", "output_port", "maxInitialPeersRange")
-    assert [root.findtext(f".//{tag}") for tag in said] == ["true", "0", "7999", "1"]
-    assert root.findtext(".//interfaceWhiteList/address") == "10.77.0.1"
-
-
-def test_shared_memory_alone_says_nothing_of_locators_and_keeps_its_ports_free_to_move() -> None:
-    root = made("shm://")
-    assert [each.text for each in root.findall(".//transport_descriptor/type")] == ["SHM"]
-    assert root.findall(".//locator") == []
-    assert root.findall(".//mutation_tries") == []
-
-
-def test_a_group_beside_tcp_shares_one_profile() -> None:
-    root = made("udpm://239.255.1.9:7901?ttl=0&interface=127.0.0.1", "tcpv4://10.77.0.1:5100")
-    types = [each.text for each in root.findall(".//transport_descriptor/type")]
-    assert types == ["UDPv4", "TCPv4"]
-    assert locators(root, "defaultMulticastLocatorList") == [
-        {"kind": "udpv4", "address": "239.255.1.9", "port": "7901"}
-    ]
-    assert root.findtext(".//TTL") == "0"
-    assert root.findtext(".//listening_ports/port") == "5100"
-
-
 @pytest.mark.parametrize(("super_client", "protocol"), [(True, "SUPER_CLIENT"), (False, "CLIENT")])
 def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str) -> None:
     root = made(
@@ -69,11 +34,6 @@ def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str
     assert root.findtext(".//discoveryProtocol") == protocol
     prefixes = [each.get("prefix") for each in root.findall(".//RemoteServer")]
     assert prefixes == [f"44.53.0{n}.5f.45.50.52.4f.53.49.4d.41" for n in (0, 1)]
-
-
-def test_urls_that_one_participant_cannot_have_together_are_refused() -> None:
-    with pytest.raises(MiddlewareError, match="cannot use 'shm://' beside 'udpv4://:7911'"):
-        made("shm://", "udpv4://:7911")
 
 
 @pytest.mark.parametrize("url", ["tcpv4://10.77.0.1:5100", "shm://"])

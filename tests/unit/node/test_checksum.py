@@ -41,50 +41,35 @@ def test_a_checksum_is_sixteen_hex_digits() -> None:
     assert int(checksum(CAMERA), 16) >= 0
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        replace(CAMERA, state="inactive"),
-        replace(CAMERA, connected=False),
-        replace(CAMERA, checksum="0123456789abcdef"),
-        _with(endpoint=replace(VIDEO, matched=2)),
-        _with(endpoint=replace(VIDEO, matched=None)),
-        _with(endpoint=replace(VIDEO, server_matched=True)),
-        _with(connection=replace(NET, established=False)),
-    ],
-    ids=["state", "connected", "checksum", "matched", "not counted", "server", "established"],
-)
+SAME = {
+    "state": replace(CAMERA, state="inactive"),
+    "connected": replace(CAMERA, connected=False),
+    "checksum": replace(CAMERA, checksum="0123456789abcdef"),
+    "matched": _with(endpoint=replace(VIDEO, matched=2)),
+    "not counted": _with(endpoint=replace(VIDEO, matched=None)),
+    "server": _with(endpoint=replace(VIDEO, server_matched=True)),
+    "established": _with(connection=replace(NET, established=False)),
+}
+OTHERS = {
+    "process": replace(CAMERA, identity=replace(CAMERA.identity, process_id=2)),
+    "transports": replace(CAMERA, transports=("shm", "udpv4")),
+    "mapped": _with(endpoint=replace(VIDEO, mapped=False)),
+    "connection of an endpoint": _with(endpoint=replace(VIDEO, connection="")),
+    "error of an endpoint": _with(endpoint=replace(VIDEO, error="cannot make it")),
+    "urls": _with(connection=replace(NET, urls=("shm://",))),
+    "error of a connection": _with(connection=replace(NET, error="cannot open it")),
+    "mappings": _with(connection=replace(NET, mappings=())),
+    "connections": replace(CAMERA, connections=()),
+    "endpoints": replace(CAMERA, endpoints=()),
+}
+
+
+@pytest.mark.parametrize("changed", SAME.values(), ids=SAME)
 def test_what_events_tell_makes_nobody_read_again(changed: NodeConfiguration) -> None:
     assert changed != CAMERA
     assert checksum(changed) == checksum(CAMERA)
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        replace(CAMERA, identity=replace(CAMERA.identity, process_id=2)),
-        replace(CAMERA, transports=("shm", "udpv4")),
-        _with(endpoint=replace(VIDEO, mapped=False)),
-        _with(endpoint=replace(VIDEO, connection="")),
-        _with(endpoint=replace(VIDEO, error="cannot make it")),
-        _with(connection=replace(NET, urls=("shm://",))),
-        _with(connection=replace(NET, error="cannot open it")),
-        _with(connection=replace(NET, mappings=())),
-        replace(CAMERA, connections=()),
-        replace(CAMERA, endpoints=()),
-    ],
-    ids=[
-        "process",
-        "transports",
-        "mapped",
-        "connection of an endpoint",
-        "error of an endpoint",
-        "urls",
-        "error of a connection",
-        "mappings",
-        "connections",
-        "endpoints",
-    ],
-)
+@pytest.mark.parametrize("changed", OTHERS.values(), ids=OTHERS)
 def test_whatever_else_changes_is_to_be_read_again(changed: NodeConfiguration) -> None:
     assert checksum(changed) != checksum(CAMERA)

@@ -164,17 +164,10 @@ def test_a_sync_callback_beyond_its_deadline_is_an_error_that_says_what_to_do() 
     )
 
 
-def test_keyboard_interrupt_is_not_swallowed() -> None:
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, asyncio.CancelledError])
+def test_what_ends_more_than_a_callback_is_not_swallowed(ending: type[BaseException]) -> None:
     def on_configure() -> None:
-        raise KeyboardInterrupt
+        raise ending
 
-    with pytest.raises(KeyboardInterrupt):
-        drive(on_configure)
-
-
-def test_cancelled_error_of_asyncio_is_not_swallowed() -> None:
-    def on_configure() -> None:
-        raise asyncio.CancelledError
-
-    with pytest.raises(asyncio.CancelledError):
+    with pytest.raises(ending):
         drive(on_configure)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.target import (
@@ -216,13 +215,6 @@ def test_a_token_that_the_server_quotes_in_its_refusal_is_not_repeated(bench: Be
     assert "401 Unauthorized: UNAUTHENTICATED: cannot accept 'Bearer ***'" in str(caught.value)
 
 
-def test_an_answer_without_end_is_not_read_to_its_end(bench: Bench) -> None:
-    bench.server.failures = [("POST", Answer(201, {"sessionId": "x" * 5_000_000}))]
-
-    with pytest.raises(PartlyError, match="at most 4194304 are read"):
-        bench.make().apply([rule()])
-
-
 def test_a_renewal_that_fails_says_which_flow_will_lose_its_session(bench: Bench) -> None:
     target = bench.make(duration_s=1000)
     target.apply([rule()])
@@ -257,18 +249,6 @@ def test_an_answer_that_was_lost_is_looked_up_by_device(bench: Bench) -> None:
         "retrieve-sessions",
     ]
     assert only(target.apply([rule()])).kind.value == "keep"
-
-
-def test_a_pending_session_of_a_dead_run_is_found_and_removed(bench: Bench) -> None:
-    target = bench.make()
-    target.apply([rule()])
-    (record,) = bench.ledger.read().targets
-    died = replace(record.entries[0], id="")
-    bench.ledger.put(replace(record, entries=(died,)))
-
-    target.remove()
-
-    assert bench.server.sessions == {}
 
 
 def test_the_document_that_checks_these_requests_does_refuse_wrong_ones(bench: Bench) -> None:

@@ -110,7 +110,3 @@ def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:
         "five_qi_reason",
     }
     assert row["outcome"] == "unverifiable"
-
-
-def test_no_flows_are_a_header_only() -> None:
-    assert flows_to_csv([]) == ",".join((*COLUMNS, *NUMBERS)) + "\n"

@@ -166,7 +166,6 @@ def session(**changed: object) -> Behave:
 
 HOSTILE: dict[str, tuple[str, Behave, str]] = {
     "headers drip": ("camara", drips(b"HTTP/1.1 201 Created\r\nx-a: "), "no whole answer in time"),
-    "the status drips": ("camara", drips(b"HTTP/1.1 2"), "no whole answer in time"),
     "a body drips": (
         "camara",
         drips(b"HTTP/1.1 201 Created\r\ncontent-length: 9999\r\n\r\n"),
@@ -191,20 +190,10 @@ HOSTILE: dict[str, tuple[str, Behave, str]] = {
         floods(b"", b"HTTP/1.1 103 Early Hints\r\n\r\n" * 50),
         "no whole answer in time",
     ),
-    "chunks that are none": (
-        "nef",
-        sends(b"HTTP/1.1 201 Created\r\ntransfer-encoding: chunked\r\n\r\nzz\r\nhello"),
-        "illegal chunk header",
-    ),
     "a body shorter than said": (
         "camara",
         sends(b"HTTP/1.1 201 Created\r\ncontent-length: 99\r\n\r\n{}"),
         "peer closed connection",
-    ),
-    "a length below zero": (
-        "camara",
-        sends(b"HTTP/1.1 201 Created\r\ncontent-length: -1\r\n\r\n{}"),
-        "bad Content-Length",
     ),
     "a body without end": (
         "camara",
@@ -234,8 +223,6 @@ HOSTILE: dict[str, tuple[str, Behave, str]] = {
     "deep JSON": ("camara", answers(DEEP), "its body: "),
     "no JSON": ("camara", answers(b"<html>"), "its body: JSON is malformed"),
     "no UTF-8": ("camara", answers(b'{"sessionId": "\xff"}'), "its body: 'utf-8' codec"),
-    "NaN": ("camara", answers(b'{"duration": NaN}'), "its body: JSON is malformed"),
-    "a number of 5000 digits": ("camara", answers(b"9" * 5000), "its body: "),
     "an array": ("camara", answers([SESSION]), "its body: Expected `object`"),
     "a text": ("nef", answers("made"), "its body: Expected `object`"),
     "no body": ("camara", answers(b""), "its body: "),
@@ -251,30 +238,17 @@ HOSTILE: dict[str, tuple[str, Behave, str]] = {
         "sessionId: ",
     ),
     "an id of a megabyte": ("camara", session(sessionId="a" * 2**20), "sessionId: "),
-    "a lone surrogate": ("camara", session(sessionId="\ud800"), "its body: JSON is malformed"),
     "a duration of 401 digits": (
         "camara",
         session(duration=BIG),
         "duration: Expected `int` <= 2147483647",
     ),
-    "a duration in words": ("camara", session(duration="1 h"), "duration: Expected `int"),
-    "a duration that is true": ("camara", session(duration=True), "duration: Expected `int"),
     "a duration below zero": ("camara", session(duration=-5), "duration: Expected `int` >= 1"),
     "no date": ("camara", session(expiresAt="soon"), "expiresAt: Invalid RFC3339"),
-    "a date of 1": (
-        "camara",
-        session(expiresAt="0001-01-01T00:00:00+23:59", qosStatus="X"),
-        "qosStatus: Invalid enum value 'X'",
-    ),
     "a state that is a list": (
         "camara",
         session(qosStatus=["AVAILABLE"]),
         "qosStatus: Expected `str`",
-    ),
-    "a reason that is a list": (
-        "camara",
-        session(qosStatus="UNAVAILABLE", statusInfo=[1]),
-        "statusInfo",
     ),
     "a Location that is no URL": (
         "nef",

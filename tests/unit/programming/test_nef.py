@@ -47,19 +47,19 @@ class Bench:
 def bench(tmp_path: Path) -> Iterator[Bench]:
     """A NEF without subscriptions."""
     with NefServer() as server:
-        yield from _bench(tmp_path, server)
+        yield made(tmp_path, server)
 
 
-def _bench(tmp_path: Path, server: NefServer, **settings: object) -> Iterator[Bench]:
+def made(tmp_path: Path, server: NefServer) -> Bench:
     ledger = ledger_in(tmp_path)
     clock = Clock()
-    file = settings_file(tmp_path, nef=nef_settings(server.url, **settings))
+    file = settings_file(tmp_path, nef=nef_settings(server.url))
     targets = Means(ledger, clock=clock)
 
     def make() -> Target:
         return read_targets(["nef"], {"config": file})[0].open(targets)
 
-    yield Bench(make(), server, ledger, clock, make)
+    return Bench(make(), server, ledger, clock, make)
 
 
 def kinds(changes: TargetChanges) -> list[str]:
@@ -200,30 +200,20 @@ def test_a_server_that_writes_protocols_by_name_is_not_corrected_for_ever(bench:
     assert kinds(bench.target.plan([rule()])) == ["keep"]
 
 
-def test_the_protocol_is_written_by_name_where_settings_say_so(tmp_path: Path) -> None:
-    with NefServer() as server:
-        for bench in _bench(tmp_path, server, protocol_by_name=True):
-            bench.target.apply([rule()])
-        assert "permit in udp from" in str(server.subscriptions)
-
-
-def test_retry_after_is_waited_for(bench: Bench) -> None:
-    bench.server.failures = [("POST", Answer(429, None, {"retry-after": "7"}))]
-
-    bench.target.apply([rule()])
-
-    assert bench.clock.slept == [7.0]
-    assert bench.server.methods() == ["POST", "POST"]
-
-
-def test_a_retry_after_that_is_a_date_is_waited_for(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("status", "after", "waited_s"),
     # 1 700 000 000 s is 22:13:20 of that day.
-    when = "Tue, 14 Nov 2023 22:13:29 GMT"
-    bench.server.failures = [("POST", Answer(503, None, {"retry-after": when}))]
+    [(429, "7", 7.0), (503, "Tue, 14 Nov 2023 22:13:29 GMT", 9.0)],
+)
+def test_retry_after_is_waited_for_as_a_time_or_a_date(
+    bench: Bench, status: int, after: str, waited_s: float
+) -> None:
+    bench.server.failures = [("POST", Answer(status, None, {"retry-after": after}))]
 
     bench.target.apply([rule()])
 
-    assert bench.clock.slept == [9.0]
+    assert bench.clock.slept == [waited_s]
+    assert bench.server.methods() == ["POST", "POST"]
 
 
 def test_a_retry_after_beyond_all_patience_is_an_error_that_says_so(bench: Bench) -> None:
@@ -311,10 +301,10 @@ def test_reading_is_tried_again_after_a_server_error(bench: Bench) -> None:
 def test_nobody_at_the_address_is_one_clear_error(tmp_path: Path) -> None:
     with NefServer() as server:
         pass
-    for bench in _bench(tmp_path, server):
-        with pytest.raises(PartlyError, match=r"cannot POST .*: .*Connection refused"):
-            bench.target.apply([rule()])
-        assert bench.ledger.read().targets == ()
+    bench = made(tmp_path, server)
+    with pytest.raises(PartlyError, match=r"cannot POST .*: .*Connection refused"):
+        bench.target.apply([rule()])
+    assert bench.ledger.read().targets == ()
 
 
 def test_a_redirect_is_not_followed_with_our_token(bench: Bench) -> None:

@@ -13,7 +13,6 @@ from lifecycle.network.dscp import MAX_DSCP
 from lifecycle.programming.nft import (
     MAX_COMMENT_BYTES,
     digest_of,
-    nft_keyword,
     render_nft,
     render_table_removal,
     table_name,
@@ -33,13 +32,6 @@ def ruleset() -> str:
 
 def test_a_ruleset_is_one_table_that_is_replaced_in_one_transaction() -> None:
     assert ruleset() == (EXPECTED / "teleop.nft").read_text(encoding="utf-8")
-
-
-def test_nft_accepts_the_ruleset(tmp_path: Path) -> None:
-    file = tmp_path / "teleop.nft"
-    file.write_text(ruleset(), encoding="utf-8")
-    done = in_a_network_namespace("nft", "-c", "-f", str(file))
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_nft_knows_how_every_dscp_is_spelled(tmp_path: Path) -> None:
@@ -76,12 +68,6 @@ nft -f {gone}; nft -f {gone}; nft list ruleset"""
     assert done.stdout.split() == ["table", "inet", "someone_else", "{", "}"]
 
 
-def test_a_removal_names_our_table_only() -> None:
-    assert render_table_removal(table_name("teleop")) == (
-        "add table inet flowqos_teleop\ndelete table inet flowqos_teleop\n"
-    )
-
-
 def test_without_rules_the_table_is_there_and_empty() -> None:
     text = render_nft([], system="teleop")
     assert text.splitlines()[3:] == [
@@ -116,14 +102,6 @@ def test_a_comment_that_nftables_would_not_keep_is_cut() -> None:
     (comment,) = re.findall(r'17910 comment "(.*)",', render_nft([long], system="teleop"))
     assert comment == f"/{'é' * 61}..."
     assert len(comment.encode()) <= MAX_COMMENT_BYTES
-
-
-@pytest.mark.parametrize(
-    ("dscp", "keyword"),
-    [(0, "cs0"), (1, "lephb"), (44, "va"), (45, "45"), (46, "ef"), (5, "5"), (34, "af41")],
-)
-def test_nft_has_words_of_its_own_for_some_code_points(dscp: int, keyword: str) -> None:
-    assert nft_keyword(dscp) == keyword
 
 
 def test_a_table_without_our_comment_is_not_ours() -> None:

@@ -210,16 +210,6 @@ def test_all_failures_are_told_together(tmp_path: Path) -> None:
     assert str(caught.value) == "cannot make 2 of 2 changes to targets:\n  cannot one\n  cannot two"
 
 
-def test_a_diff_changes_nothing(tmp_path: Path) -> None:
-    target = FakeTarget()
-    programs = programmer(tmp_path, target)
-
-    (changes,) = programs.diff([report()])
-
-    assert changes.pending
-    assert target.applied == 0
-
-
 def test_the_source_address_is_what_this_host_sends_from_where_it_is_the_publishers() -> None:
     here = plan(robot="127.0.0.1")
     sources = RouteSources(here)

@@ -75,10 +75,6 @@ if tc -batch gone 2>&1; then exit 1; fi"""
     assert "1f10:" not in done.stdout
 
 
-def test_a_removal_names_our_handle_so_that_nobody_elses_qdisc_goes() -> None:
-    assert render_tc_removal("eth0") == "qdisc del dev eth0 root handle 1f10:\n"
-
-
 def test_ef_comes_first_and_less_than_best_effort_last() -> None:
     rules = [replace(VIDEO, dscp=dscp, five_qi=None) for dscp in range(MAX_DSCP + 1)]
     names = [each.name for each in classes_of(rules)]

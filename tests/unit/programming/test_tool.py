@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -138,15 +139,21 @@ def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "kbit"), [("20mbit", 20_000), ("512kbit", 512), ("1Gbit", 1_000_000), ("2000bit", 2)]
+    ("read", "text", "value"),
+    [
+        (parse_rate, "20mbit", 20_000),
+        (parse_rate, "512kbit", 512),
+        (parse_rate, "1Gbit", 1_000_000),
+        (parse_rate, "2000bit", 2),
+        (parse_queue, "50ms", 50.0),
+        (parse_queue, "1.5s", 1500.0),
+        (parse_queue, "500us", 0.5),
+    ],
 )
-def test_rates_are_read_as_tc_spells_them(text: str, kbit: int) -> None:
-    assert parse_rate(text) == kbit
-
-
-@pytest.mark.parametrize(("text", "ms"), [("50ms", 50.0), ("1.5s", 1500.0), ("500us", 0.5)])
-def test_times_are_read_as_tc_spells_them(text: str, ms: float) -> None:
-    assert parse_queue(text) == ms
+def test_rates_in_kbit_and_times_in_ms_are_read_as_tc_spells_them(
+    read: Callable[[str], float], text: str, value: float
+) -> None:
+    assert read(text) == value
 
 
 @pytest.mark.parametrize("text", ["", "50", "0ms", "-1ms", "1e3ms", "1.0000ms", "٣ms", "50kbit"])
