@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 from click.testing import CliRunner
@@ -86,37 +89,34 @@ def test_what_is_not_there_is_said_with_what_is(root: Path, words: list[str], me
     assert done.stderr.startswith(message)
 
 
-def test_what_is_written_is_followed(root: Path) -> None:
-    folder = run(root, 1, talker="one\n")
-    with subprocess.Popen(
-        [sys.executable, "-m", "lifecycle", "logs", "talker", "-f"],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as following:
+@contextlib.contextmanager
+def followed(*words: str) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
+    """Follow logs until the end of the block, and then interrupt it."""
+    command = [sys.executable, "-m", "lifecycle", "logs", *words, "-f"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as following:
         assert following.stdout is not None
-        assert following.stdout.readline() == "one\n"
-        with (folder / "talker.log").open("a") as log:
-            log.write("two\n")
-        assert following.stdout.readline() == "two\n"
+        yield following, following.stdout
         following.send_signal(signal.SIGINT)
         assert following.wait(30) == 130
+
+
+def test_what_is_written_is_followed(root: Path) -> None:
+    folder = run(root, 1, talker="one\n")
+    with followed("talker") as (_, shown_now):
+        assert shown_now.readline() == "one\n"
+        with (folder / "talker.log").open("a") as log:
+            log.write("two\n")
+        assert shown_now.readline() == "two\n"
 
 
 def test_a_log_that_does_not_exist_yet_is_waited_for_while_its_run_lasts(root: Path) -> None:
     folder = run(root, 1, pid=os.getpid())
     for words, line in ((["talker"], "one\n"), ([], "talker | one\n")):
-        with subprocess.Popen(
-            [sys.executable, "-m", "lifecycle", "logs", *words, "-f"],
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as following:
-            assert following.stdout is not None
+        with followed(*words) as (following, shown_now):
             with pytest.raises(subprocess.TimeoutExpired):
                 following.wait(1.5 if words else 0.1)
             (folder / "talker.log").write_text("one\n")
-            assert following.stdout.readline() == line
-            following.send_signal(signal.SIGINT)
-            assert following.wait(30) == 130
+            assert shown_now.readline() == line
     over = run(root, 2)
     assert shown("-f") == []
     with pytest.raises(UsageError, match="cannot find the log of 'talker'"):

@@ -330,6 +330,19 @@ def test_a_burst_is_waited_out_but_not_for_ever(observer: Observer, graph: FakeG
     assert quiet_s == pytest.approx(0.01, abs=0.003)
 
 
+def test_a_transition_of_a_node_that_is_asked_wakes(
+    observer: Observer, graph: FakeGraph, clients: FakeClients
+) -> None:
+    graph.nodes, clients.states = managed("/a"), {"/a": "inactive"}
+
+    async def transition() -> None:
+        await observer.observe(plan("a"))
+        clients.followed["/a"]()
+        await asyncio.wait_for(observer.wait_change(), 5)
+
+    run(transition())
+
+
 def test_who_has_left_is_called_back_no_more(graph: FakeGraph, clients: FakeClients) -> None:
     observer = observing(graph, clients)
     assert len(graph.callbacks) == 1

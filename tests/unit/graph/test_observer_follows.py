@@ -196,3 +196,14 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask(*, follows:
         }
 
     in_world(main, follows=follows)
+
+
+def test_what_was_put_of_a_node_whose_process_ended_is_judged_no_more() -> None:
+    async def main(world: World) -> None:
+        world.state.put_configuration(configuration("/put"))
+        assert [each.name for each in world.state.nodes()] == ["/put"]
+        world.state.drop_configuration("/put")
+        assert (await world.observer.observe(plan("put"))).configurations == ()
+        assert world.state.nodes() == ()
+
+    in_world(main)

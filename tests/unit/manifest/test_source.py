@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,26 +26,30 @@ def _message(path: str | Path) -> str:
     return str(only).removeprefix(f"{path}:1:1: ")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "none.lifecycle.yaml"
-    assert _message(path) == f"cannot open '{path}': No such file or directory"
-
-
-def test_a_directory_is_refused(tmp_path: Path) -> None:
-    assert _message(tmp_path) == "cannot read a directory as a manifest; name a regular file"
-
-
 @pytest.mark.timeout(5)
-def test_a_fifo_without_a_writer_does_not_block(tmp_path: Path) -> None:
-    path = tmp_path / "fifo.lifecycle.yaml"
-    os.mkfifo(path)
-    assert _message(path) == "cannot read a FIFO as a manifest; name a regular file"
-
-
-@pytest.mark.timeout(5)
-def test_an_endless_device_is_refused() -> None:
-    expected = "cannot read a character device as a manifest; name a regular file"
-    assert _message("/dev/zero") == expected
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda _: None, "cannot open '{path}': No such file or directory"),
+        (Path.mkdir, "cannot read a directory as a manifest; name a regular file"),
+        (os.mkfifo, "cannot read a FIFO as a manifest; name a regular file"),
+        (
+            lambda path: path.symlink_to("/dev/zero"),
+            "cannot read a character device as a manifest; name a regular file",
+        ),
+        (
+            lambda path: path.symlink_to(path),
+            "cannot open '{path}': Too many levels of symbolic links",
+        ),
+    ],
+    ids=["nothing", "a directory", "a FIFO", "a device", "a circle of links"],
+)
+def test_what_is_no_regular_file_is_refused_at_once(
+    make: Callable[[Path], object], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.lifecycle.yaml"
+    make(path)
+    assert _message(path) == message.format(path=path)
 
 
 def test_a_socket_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,12 +58,6 @@ def test_a_socket_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         server.bind("s.lifecycle.yaml")
         expected = "cannot open 's.lifecycle.yaml': No such device or address"
         assert _message("s.lifecycle.yaml") == expected
-
-
-def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "loop.lifecycle.yaml"
-    path.symlink_to(path)
-    assert _message(path) == f"cannot open '{path}': Too many levels of symbolic links"
 
 
 def test_a_path_with_a_nul_byte_is_refused() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Iterator
 
@@ -90,22 +89,6 @@ def test_the_holder_learns_how_long_it_took_only_beyond_the_limit(
     assert busy_s >= LIMIT_S
     assert watcher.look()[0] is None
     assert holder.end() is None
-
-
-def test_a_stopped_process_does_not_keep_the_watcher_from_noticing(
-    sides: tuple[BusySign, BusySign],
-) -> None:
-    holder, watcher = sides
-    pid = os.fork()
-    if pid == 0:
-        holder.begin()
-        os.kill(os.getpid(), signal.SIGSTOP)
-        os._exit(0)
-    try:
-        assert until_overdue(watcher) > 0
-    finally:
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
 
 
 class Turns:

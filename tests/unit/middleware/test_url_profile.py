@@ -7,6 +7,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
 from lifecycle.plan.model import ParticipantConnections
 
@@ -34,6 +35,11 @@ def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str
     assert root.findtext(".//discoveryProtocol") == protocol
     prefixes = [each.get("prefix") for each in root.findall(".//RemoteServer")]
     assert prefixes == [f"44.53.0{n}.5f.45.50.52.4f.53.49.4d.41" for n in (0, 1)]
+
+
+def test_urls_that_one_participant_cannot_have_together_are_refused() -> None:
+    with pytest.raises(MiddlewareError, match="cannot use 'shm://' beside 'udpv4://:7911'"):
+        made("shm://", "udpv4://:7911")
 
 
 @pytest.mark.parametrize("url", ["tcpv4://10.77.0.1:5100", "shm://"])

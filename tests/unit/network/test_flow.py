@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -52,37 +53,49 @@ def test_a_flow_is_written_as_its_5_tuple_and_on_ipv6_with_its_label() -> None:
     assert flow.describe() == "udp [fd09::1]:7411 → [fd09::2]:7000 flow_label unset"
 
 
-def test_fast_dds_sends_unicast_from_its_wildcard_socket() -> None:
-    source = [shared_memory(), nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)]
-    (flow,) = flow_tuples(source, [shared_memory(), nfe("10.0.0.2", 7000)])
-    assert ends(flow) == ("0.0.0.0", 45000, "10.0.0.2", 7000)
+ANY, LOOPBACK, ONE = nfe("0.0.0.0", 45000), nfe("127.0.0.1", 45000), nfe("10.0.0.1", 45001)
 
 
-def test_fast_dds_sends_multicast_from_the_socket_of_each_interface() -> None:
-    source = [nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001), nfe("192.168.1.1", 45002)]
-    flows = flow_tuples(source, [nfe("239.255.0.1", 7401)])
-    assert [ends(flow)[:2] for flow in flows] == [("10.0.0.1", 45001), ("192.168.1.1", 45002)]
-
-
-def test_a_sender_of_one_kind_serves_both_destinations() -> None:
-    source = [nfe("10.0.0.1", 45001)]
-    flows = flow_tuples(source, [nfe("10.0.0.2", 7000), nfe("239.255.0.1", 7401)])
-    assert [flow.destination_address for flow in flows] == ["10.0.0.2", "239.255.0.1"]
-
-
-def test_loopback_talks_to_loopback_only() -> None:
-    source = [nfe("127.0.0.1", 45000), nfe("10.0.0.1", 45001)]
-    flows = flow_tuples(source, [nfe("127.0.0.1", 7000), nfe("10.0.0.2", 7000)])
-    assert [ends(flow) for flow in flows] == [
-        ("127.0.0.1", 45000, "127.0.0.1", 7000),
-        ("10.0.0.1", 45001, "10.0.0.2", 7000),
+@pytest.mark.parametrize(
+    ("source", "destination", "flows"),
+    [
+        # Fast DDS sends unicast from its wildcard socket, multicast from that of each interface.
+        ([ANY, ONE], [nfe("10.0.0.2", 7000)], [(ANY, "10.0.0.2")]),
+        (
+            [ANY, ONE, nfe("192.168.1.1", 45002)],
+            [nfe("239.255.0.1", 7000)],
+            [(ONE, "239.255.0.1"), (nfe("192.168.1.1", 45002), "239.255.0.1")],
+        ),
+        # A sender of one kind serves both destinations.
+        (
+            [ONE],
+            [nfe("10.0.0.2", 7000), nfe("239.255.0.1", 7000)],
+            [(ONE, "10.0.0.2"), (ONE, "239.255.0.1")],
+        ),
+        # Loopback talks to loopback and groups only, to which a wildcard talks, too.
+        (
+            [LOOPBACK, ONE],
+            [nfe("127.0.0.1", 7000), nfe("10.0.0.2", 7000)],
+            [(LOOPBACK, "127.0.0.1"), (ONE, "10.0.0.2")],
+        ),
+        ([ANY], [nfe("127.0.0.1", 7000)], [(ANY, "127.0.0.1")]),
+        ([LOOPBACK], [nfe("239.255.0.1", 7000)], [(LOOPBACK, "239.255.0.1")]),
+        ([LOOPBACK], [nfe("10.0.0.2", 7000)], []),
+        # Protocols do not mix, and shared memory forms no flow.
+        ([ONE], [nfe("10.0.0.2", 7000, TCP)], []),
+        ([ONE], [nfe("fd09::2", 7000)], []),
+        ([], [], []),
+    ],
+)
+def test_a_destination_is_reached_from_the_sockets_that_fast_dds_sends_from(
+    source: list[NetworkFlowEndpoint],
+    destination: list[NetworkFlowEndpoint],
+    flows: list[tuple[NetworkFlowEndpoint, str]],
+) -> None:
+    found = flow_tuples([shared_memory(), *source], [shared_memory(), *destination])
+    assert [ends(flow) for flow in found] == [
+        (sender.internet_address, sender.transport_port, address, 7000) for sender, address in flows
     ]
-
-
-def test_protocols_do_not_mix_and_shared_memory_forms_no_flow() -> None:
-    assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("10.0.0.2", 2, TCP)]) == ()
-    assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("fd09::2", 2)]) == ()
-    assert flow_tuples([shared_memory()], [shared_memory()]) == ()
 
 
 NFES = st.lists(
@@ -111,10 +124,3 @@ def test_every_flow_has_its_ends_among_the_nfes_and_is_listed_once(
             (each.transport_protocol, each.internet_address, each.transport_port)
             for each in destination
         }
-
-
-def test_a_wildcard_sender_reaches_loopback_and_a_loopback_sender_a_group() -> None:
-    for source, destination in (("0.0.0.0", "127.0.0.1"), ("127.0.0.1", "239.255.0.1")):
-        (flow,) = flow_tuples([nfe(source, 7411)], [nfe(destination, 7401)])
-        assert ends(flow) == (source, 7411, destination, 7401)
-    assert flow_tuples([nfe("127.0.0.1", 7411)], [nfe("10.0.0.2", 7401)]) == ()

@@ -41,3 +41,13 @@ def test_who_writes_never_waits_and_the_newest_arrives_in_order() -> None:
     channel.drain()
     ours.close()
     theirs.close()
+
+
+def test_a_supervisor_that_has_gone_holds_nobody_up() -> None:
+    ours, theirs = socket.socketpair()
+    theirs.send(b"\n")
+    channel = HostChannel(ours)
+    theirs.close()
+    channel.write(Event(kind="ready"))
+    channel.drain()
+    ours.close()

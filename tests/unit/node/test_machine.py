@@ -21,66 +21,64 @@ from lifecycle.node.lifecycle.machine import (
 )
 from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 
+S, R = NodeState, TransitionRequest
 OK, FAILURE, ERROR = CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR
 
 PATHS: dict[NodeState, str] = {
-    NodeState.UNCONFIGURED: "",
-    NodeState.CONFIGURING: "configure",
-    NodeState.INACTIVE_DISCONNECTED: "configure OK",
-    NodeState.CONNECTING: "configure OK connect",
-    NodeState.INACTIVE_CONNECTED: "configure OK connect OK",
-    NodeState.DISCONNECTING: "configure OK connect OK disconnect",
-    NodeState.ACTIVATING_DISCONNECTED: "configure OK activate",
-    NodeState.ACTIVATING_CONNECTED: "configure OK activate OK",
-    NodeState.ACTIVE: "configure OK activate OK OK",
-    NodeState.DEACTIVATING: "configure OK activate OK OK deactivate",
-    NodeState.CLEANINGUP_CONNECTED: "configure OK connect OK cleanup",
-    NodeState.CLEANINGUP_DISCONNECTED: "configure OK cleanup",
-    NodeState.SHUTTINGDOWN: "shutdown",
-    NodeState.ERRORPROCESSING: "configure ERROR",
-    NodeState.FINALIZED: "shutdown OK",
+    S.UNCONFIGURED: "",
+    S.CONFIGURING: "configure",
+    S.INACTIVE_DISCONNECTED: "configure OK",
+    S.CONNECTING: "configure OK connect",
+    S.INACTIVE_CONNECTED: "configure OK connect OK",
+    S.DISCONNECTING: "configure OK connect OK disconnect",
+    S.ACTIVATING_DISCONNECTED: "configure OK activate",
+    S.ACTIVATING_CONNECTED: "configure OK activate OK",
+    S.ACTIVE: "configure OK activate OK OK",
+    S.DEACTIVATING: "configure OK activate OK OK deactivate",
+    S.CLEANINGUP_CONNECTED: "configure OK connect OK cleanup",
+    S.CLEANINGUP_DISCONNECTED: "configure OK cleanup",
+    S.SHUTTINGDOWN: "shutdown",
+    S.ERRORPROCESSING: "configure ERROR",
+    S.FINALIZED: "shutdown OK",
 }
 
 TAKEN: dict[tuple[NodeState, TransitionRequest], NodeState] = {
-    (NodeState.UNCONFIGURED, TransitionRequest.CONFIGURE): NodeState.CONFIGURING,
-    (NodeState.UNCONFIGURED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.CONNECT): NodeState.CONNECTING,
-    (
-        NodeState.INACTIVE_DISCONNECTED,
-        TransitionRequest.ACTIVATE,
-    ): NodeState.ACTIVATING_DISCONNECTED,
-    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.CLEANUP): NodeState.CLEANINGUP_DISCONNECTED,
-    (NodeState.INACTIVE_DISCONNECTED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.INACTIVE_CONNECTED, TransitionRequest.DISCONNECT): NodeState.DISCONNECTING,
-    (NodeState.INACTIVE_CONNECTED, TransitionRequest.ACTIVATE): NodeState.ACTIVATING_CONNECTED,
-    (NodeState.INACTIVE_CONNECTED, TransitionRequest.CLEANUP): NodeState.CLEANINGUP_CONNECTED,
-    (NodeState.INACTIVE_CONNECTED, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
-    (NodeState.ACTIVE, TransitionRequest.DEACTIVATE): NodeState.DEACTIVATING,
-    (NodeState.ACTIVE, TransitionRequest.SHUTDOWN): NodeState.SHUTTINGDOWN,
+    (S.UNCONFIGURED, R.CONFIGURE): S.CONFIGURING,
+    (S.UNCONFIGURED, R.SHUTDOWN): S.SHUTTINGDOWN,
+    (S.INACTIVE_DISCONNECTED, R.CONNECT): S.CONNECTING,
+    (S.INACTIVE_DISCONNECTED, R.ACTIVATE): S.ACTIVATING_DISCONNECTED,
+    (S.INACTIVE_DISCONNECTED, R.CLEANUP): S.CLEANINGUP_DISCONNECTED,
+    (S.INACTIVE_DISCONNECTED, R.SHUTDOWN): S.SHUTTINGDOWN,
+    (S.INACTIVE_CONNECTED, R.DISCONNECT): S.DISCONNECTING,
+    (S.INACTIVE_CONNECTED, R.ACTIVATE): S.ACTIVATING_CONNECTED,
+    (S.INACTIVE_CONNECTED, R.CLEANUP): S.CLEANINGUP_CONNECTED,
+    (S.INACTIVE_CONNECTED, R.SHUTDOWN): S.SHUTTINGDOWN,
+    (S.ACTIVE, R.DEACTIVATE): S.DEACTIVATING,
+    (S.ACTIVE, R.SHUTDOWN): S.SHUTTINGDOWN,
 }
 
 FINISHED: dict[tuple[NodeState, CallbackOutcome], NodeState] = {
-    (NodeState.CONFIGURING, OK): NodeState.INACTIVE_DISCONNECTED,
-    (NodeState.CONFIGURING, FAILURE): NodeState.UNCONFIGURED,
-    (NodeState.CONNECTING, OK): NodeState.INACTIVE_CONNECTED,
-    (NodeState.CONNECTING, FAILURE): NodeState.INACTIVE_DISCONNECTED,
-    (NodeState.DISCONNECTING, OK): NodeState.INACTIVE_DISCONNECTED,
-    (NodeState.DISCONNECTING, FAILURE): NodeState.INACTIVE_CONNECTED,
-    (NodeState.ACTIVATING_DISCONNECTED, OK): NodeState.ACTIVATING_CONNECTED,
-    (NodeState.ACTIVATING_DISCONNECTED, FAILURE): NodeState.INACTIVE_DISCONNECTED,
-    (NodeState.ACTIVATING_CONNECTED, OK): NodeState.ACTIVE,
-    (NodeState.ACTIVATING_CONNECTED, FAILURE): NodeState.INACTIVE_CONNECTED,
-    (NodeState.DEACTIVATING, OK): NodeState.INACTIVE_CONNECTED,
-    (NodeState.DEACTIVATING, FAILURE): NodeState.ACTIVE,
-    (NodeState.CLEANINGUP_CONNECTED, OK): NodeState.CLEANINGUP_DISCONNECTED,
-    (NodeState.CLEANINGUP_CONNECTED, FAILURE): NodeState.INACTIVE_CONNECTED,
-    (NodeState.CLEANINGUP_DISCONNECTED, OK): NodeState.UNCONFIGURED,
-    (NodeState.CLEANINGUP_DISCONNECTED, FAILURE): NodeState.INACTIVE_DISCONNECTED,
-    (NodeState.SHUTTINGDOWN, OK): NodeState.FINALIZED,
-    (NodeState.SHUTTINGDOWN, FAILURE): NodeState.FINALIZED,
-    (NodeState.ERRORPROCESSING, OK): NodeState.UNCONFIGURED,
-    (NodeState.ERRORPROCESSING, FAILURE): NodeState.FINALIZED,
-    (NodeState.ERRORPROCESSING, ERROR): NodeState.FINALIZED,
+    (S.CONFIGURING, OK): S.INACTIVE_DISCONNECTED,
+    (S.CONFIGURING, FAILURE): S.UNCONFIGURED,
+    (S.CONNECTING, OK): S.INACTIVE_CONNECTED,
+    (S.CONNECTING, FAILURE): S.INACTIVE_DISCONNECTED,
+    (S.DISCONNECTING, OK): S.INACTIVE_DISCONNECTED,
+    (S.DISCONNECTING, FAILURE): S.INACTIVE_CONNECTED,
+    (S.ACTIVATING_DISCONNECTED, OK): S.ACTIVATING_CONNECTED,
+    (S.ACTIVATING_DISCONNECTED, FAILURE): S.INACTIVE_DISCONNECTED,
+    (S.ACTIVATING_CONNECTED, OK): S.ACTIVE,
+    (S.ACTIVATING_CONNECTED, FAILURE): S.INACTIVE_CONNECTED,
+    (S.DEACTIVATING, OK): S.INACTIVE_CONNECTED,
+    (S.DEACTIVATING, FAILURE): S.ACTIVE,
+    (S.CLEANINGUP_CONNECTED, OK): S.CLEANINGUP_DISCONNECTED,
+    (S.CLEANINGUP_CONNECTED, FAILURE): S.INACTIVE_CONNECTED,
+    (S.CLEANINGUP_DISCONNECTED, OK): S.UNCONFIGURED,
+    (S.CLEANINGUP_DISCONNECTED, FAILURE): S.INACTIVE_DISCONNECTED,
+    (S.SHUTTINGDOWN, OK): S.FINALIZED,
+    (S.SHUTTINGDOWN, FAILURE): S.FINALIZED,
+    (S.ERRORPROCESSING, OK): S.UNCONFIGURED,
+    (S.ERRORPROCESSING, FAILURE): S.FINALIZED,
+    (S.ERRORPROCESSING, ERROR): S.FINALIZED,
 }
 
 
@@ -238,26 +236,22 @@ def test_every_transition_state_goes_on_by_every_outcome_as_the_table_says(
 ) -> None:
     node = node_in(state)
     node.finish(outcome)
-    assert node.machine.state is FINISHED.get((state, outcome), NodeState.ERRORPROCESSING)
+    assert node.machine.state is FINISHED.get((state, outcome), S.ERRORPROCESSING)
 
 
 @pytest.mark.parametrize(
     ("state", "asked", "did"),
     [
-        (NodeState.UNCONFIGURED, "configure", "prepare on_configure"),
-        (NodeState.INACTIVE_DISCONNECTED, "connect", "make on_connect"),
-        (
-            NodeState.INACTIVE_DISCONNECTED,
-            "activate",
-            "may? make on_connect on_activate open",
-        ),
-        (NodeState.INACTIVE_CONNECTED, "activate", "may? on_activate open"),
-        (NodeState.ACTIVE, "deactivate", "close on_deactivate"),
-        (NodeState.INACTIVE_CONNECTED, "disconnect", "on_disconnect remove"),
-        (NodeState.INACTIVE_DISCONNECTED, "cleanup", "on_cleanup unprepare"),
-        (NodeState.INACTIVE_CONNECTED, "cleanup", "on_disconnect remove on_cleanup unprepare"),
-        (NodeState.UNCONFIGURED, "shutdown", "on_shutdown take-down"),
-        (NodeState.ACTIVE, "shutdown", "close on_shutdown take-down"),
+        (S.UNCONFIGURED, "configure", "prepare on_configure"),
+        (S.INACTIVE_DISCONNECTED, "connect", "make on_connect"),
+        (S.INACTIVE_DISCONNECTED, "activate", "may? make on_connect on_activate open"),
+        (S.INACTIVE_CONNECTED, "activate", "may? on_activate open"),
+        (S.ACTIVE, "deactivate", "close on_deactivate"),
+        (S.INACTIVE_CONNECTED, "disconnect", "on_disconnect remove"),
+        (S.INACTIVE_DISCONNECTED, "cleanup", "on_cleanup unprepare"),
+        (S.INACTIVE_CONNECTED, "cleanup", "on_disconnect remove on_cleanup unprepare"),
+        (S.UNCONFIGURED, "shutdown", "on_shutdown take-down"),
+        (S.ACTIVE, "shutdown", "close on_shutdown take-down"),
     ],
 )
 def test_a_transition_does_these_things_in_this_order(
@@ -274,44 +268,34 @@ def test_a_transition_does_these_things_in_this_order(
 
 @pytest.mark.parametrize("asked", ["deactivate", "shutdown"])
 def test_nothing_is_sent_any_more_once_the_end_of_being_active_is_announced(asked: str) -> None:
-    node = node_in(NodeState.ACTIVE)
+    node = node_in(S.ACTIVE)
     announced: list[int] = []
     node.gate.close = lambda: announced.append(len(node.changes))
     node.machine = Machine(node, Timeouts())
-    node.follow(f"{PATHS[NodeState.ACTIVE]} {asked}")
+    node.follow(f"{PATHS[S.ACTIVE]} {asked}")
     assert announced == [len(node.changes) - 1]
 
 
 @pytest.mark.parametrize(
     ("state", "asked", "did", "goal"),
     [
+        (S.UNCONFIGURED, "configure", "prepare on_configure unprepare", S.UNCONFIGURED),
+        (S.INACTIVE_DISCONNECTED, "connect", "make on_connect undo", S.INACTIVE_DISCONNECTED),
         (
-            NodeState.UNCONFIGURED,
-            "configure",
-            "prepare on_configure unprepare",
-            NodeState.UNCONFIGURED,
-        ),
-        (
-            NodeState.INACTIVE_DISCONNECTED,
-            "connect",
-            "make on_connect undo",
-            NodeState.INACTIVE_DISCONNECTED,
-        ),
-        (
-            NodeState.INACTIVE_DISCONNECTED,
+            S.INACTIVE_DISCONNECTED,
             "activate",
             "may? make on_connect on_activate",
-            NodeState.INACTIVE_CONNECTED,
+            S.INACTIVE_CONNECTED,
         ),
-        (NodeState.INACTIVE_CONNECTED, "disconnect", "on_disconnect", NodeState.INACTIVE_CONNECTED),
+        (S.INACTIVE_CONNECTED, "disconnect", "on_disconnect", S.INACTIVE_CONNECTED),
         (
-            NodeState.INACTIVE_CONNECTED,
+            S.INACTIVE_CONNECTED,
             "cleanup",
             "on_disconnect remove on_cleanup",
-            NodeState.INACTIVE_DISCONNECTED,
+            S.INACTIVE_DISCONNECTED,
         ),
-        (NodeState.ACTIVE, "deactivate", "close on_deactivate open", NodeState.ACTIVE),
-        (NodeState.ACTIVE, "shutdown", "close on_shutdown take-down", NodeState.FINALIZED),
+        (S.ACTIVE, "deactivate", "close on_deactivate open", S.ACTIVE),
+        (S.ACTIVE, "shutdown", "close on_shutdown take-down", S.FINALIZED),
     ],
 )
 def test_a_failure_undoes_its_own_step_and_no_other(
@@ -331,9 +315,9 @@ def test_a_failure_undoes_its_own_step_and_no_other(
 @pytest.mark.parametrize(
     ("state", "request_"),
     [
-        (NodeState.UNCONFIGURED, "configure"),
-        (NodeState.INACTIVE_DISCONNECTED, "connect"),
-        (NodeState.INACTIVE_CONNECTED, "activate"),
+        (S.UNCONFIGURED, "configure"),
+        (S.INACTIVE_DISCONNECTED, "connect"),
+        (S.INACTIVE_CONNECTED, "activate"),
     ],
 )
 def test_an_error_runs_on_error_and_takes_everything_down(
@@ -346,18 +330,18 @@ def test_an_error_runs_on_error_and_takes_everything_down(
     assert node.result is not None
     assert node.result.error == f"/camera: on_{request_} returned ERROR"
     assert node.did[-2:] == ["on_error", "take-down"]
-    ends = NodeState.UNCONFIGURED if answer is OK else NodeState.FINALIZED
+    ends = S.UNCONFIGURED if answer is OK else S.FINALIZED
     assert node.machine.state is ends
 
 
 @pytest.mark.parametrize(
     ("what", "state", "asked", "doing"),
     [
-        ("prepare", NodeState.UNCONFIGURED, "configure", "configuring"),
-        ("make", NodeState.INACTIVE_DISCONNECTED, "connect", "inactive/connecting"),
-        ("open", NodeState.INACTIVE_CONNECTED, "activate", "activating/connected"),
-        ("remove", NodeState.INACTIVE_CONNECTED, "disconnect", "inactive/disconnecting"),
-        ("unprepare", NodeState.INACTIVE_DISCONNECTED, "cleanup", "cleaningup/disconnected"),
+        ("prepare", S.UNCONFIGURED, "configure", "configuring"),
+        ("make", S.INACTIVE_DISCONNECTED, "connect", "inactive/connecting"),
+        ("open", S.INACTIVE_CONNECTED, "activate", "activating/connected"),
+        ("remove", S.INACTIVE_CONNECTED, "disconnect", "inactive/disconnecting"),
+        ("unprepare", S.INACTIVE_DISCONNECTED, "cleanup", "cleaningup/disconnected"),
     ],
 )
 def test_a_bug_of_ours_is_an_error_and_not_a_stuck_node(
@@ -371,32 +355,32 @@ def test_a_bug_of_ours_is_an_error_and_not_a_stuck_node(
     assert node.result is not None
     assert node.result.outcome is ERROR
     assert node.result.error == f"cannot finish {doing} of /camera: ZeroDivisionError('ours')"
-    assert node.machine.state is NodeState.UNCONFIGURED
+    assert node.machine.state is S.UNCONFIGURED
 
 
 @pytest.mark.parametrize(
     ("asked", "did"), [("connect", "make undo"), ("activate", "may? make undo")]
 )
 def test_what_cannot_be_made_is_a_failure_of_its_step_alone(asked: str, did: str) -> None:
-    node = node_in(NodeState.INACTIVE_DISCONNECTED)
+    node = node_in(S.INACTIVE_DISCONNECTED)
     node.fail["make"] = LifecycleError("no such transport")
     node.request(TransitionRequest(asked))
     assert node.result == Result(outcome=FAILURE, error="no such transport")
     assert node.did == did.split()
-    assert node.machine.state is NodeState.INACTIVE_DISCONNECTED
+    assert node.machine.state is S.INACTIVE_DISCONNECTED
 
 
 def test_a_condition_that_refuses_leaves_the_node_as_it_is() -> None:
-    node = node_in(NodeState.INACTIVE_CONNECTED)
+    node = node_in(S.INACTIVE_CONNECTED)
     node.fail["may?"] = RefusedError("the gate is closed")
     with pytest.raises(RefusedError, match="the gate is closed"):
-        node.request(TransitionRequest.ACTIVATE)
-    assert node.machine.state is NodeState.INACTIVE_CONNECTED
+        node.request(R.ACTIVATE)
+    assert node.machine.state is S.INACTIVE_CONNECTED
     assert node.changes == []
 
 
 def test_a_callback_has_until_its_deadline() -> None:
-    node = node_in(NodeState.CONNECTING)
+    node = node_in(S.CONNECTING)
     node.callbacks["on_error"] = lambda: OK
     ((late, delay_s),) = node.timers.items()
     assert delay_s == Timeouts().connect_s
@@ -409,7 +393,7 @@ def test_a_callback_has_until_its_deadline() -> None:
 
 
 def test_shutting_down_cancels_what_runs_first() -> None:
-    node = node_in(NodeState.CONFIGURING)
+    node = node_in(S.CONFIGURING)
     node.callbacks["on_error"] = node.callbacks["on_shutdown"] = lambda: OK
     ending = node.machine.shut_down("the supervisor has gone")
     ending.send(None)
@@ -418,18 +402,18 @@ def test_shutting_down_cancels_what_runs_first() -> None:
         "cannot go on with /camera: on_configure: the supervisor has gone"
     )
     assert ended(ending).outcome is OK
-    assert node.machine.state is NodeState.FINALIZED
+    assert node.machine.state is S.FINALIZED
 
 
 def test_shutting_down_a_finalized_node_is_done_already() -> None:
-    node = node_in(NodeState.FINALIZED)
+    node = node_in(S.FINALIZED)
     assert ended(node.machine.shut_down("again")).outcome is OK
     assert node.did == []
 
 
 def test_a_refusal_says_what_is_allowed() -> None:
     with pytest.raises(RefusedError) as refused:
-        node_in(NodeState.ACTIVE).request(TransitionRequest.CONFIGURE)
+        node_in(S.ACTIVE).request(R.CONFIGURE)
     assert str(refused.value) == (
         "cannot configure in state 'active'; allowed here: deactivate, shutdown"
     )
@@ -437,7 +421,7 @@ def test_a_refusal_says_what_is_allowed() -> None:
 
 def test_a_refusal_during_a_transition_says_to_wait() -> None:
     with pytest.raises(RefusedError) as refused:
-        node_in(NodeState.ACTIVATING_CONNECTED).request(TransitionRequest.SHUTDOWN)
+        node_in(S.ACTIVATING_CONNECTED).request(R.SHUTDOWN)
     assert str(refused.value) == (
         "cannot shutdown while the node is 'activating/connected': "
         "one transition at a time; ask again when it has ended"
@@ -448,14 +432,14 @@ def test_a_refusal_during_a_transition_says_to_wait() -> None:
     ("state", "story", "announced"),
     [
         (
-            NodeState.INACTIVE_DISCONNECTED,
+            S.INACTIVE_DISCONNECTED,
             "connect OK disconnect OK",
             [(120, "connect inactive inactive"), (121, "disconnect inactive inactive")],
         ),
-        (NodeState.CONNECTING, "FAILURE", []),
-        (NodeState.CONNECTING, "ERROR", [(0, " inactive errorprocessing")]),
+        (S.CONNECTING, "FAILURE", []),
+        (S.CONNECTING, "ERROR", [(0, " inactive errorprocessing")]),
         (
-            NodeState.INACTIVE_DISCONNECTED,
+            S.INACTIVE_DISCONNECTED,
             "activate OK OK",
             [(3, "activate inactive activating"), (30, "transition_success activating active")],
         ),
@@ -473,14 +457,14 @@ def test_what_is_announced_starts_and_ends_in_states_that_rcl_has(
 @pytest.mark.parametrize(
     ("state", "labels"),
     [
-        (NodeState.UNCONFIGURED, ["configure", "shutdown"]),
-        (NodeState.INACTIVE_DISCONNECTED, ["cleanup", "activate", "shutdown", "connect"]),
-        (NodeState.INACTIVE_CONNECTED, ["cleanup", "activate", "shutdown", "disconnect"]),
-        (NodeState.CONNECTING, []),
-        (NodeState.ACTIVE, ["deactivate", "shutdown"]),
-        (NodeState.FINALIZED, []),
+        (S.UNCONFIGURED, ["configure", "shutdown"]),
+        (S.INACTIVE_DISCONNECTED, ["cleanup", "activate", "shutdown", "connect"]),
+        (S.INACTIVE_CONNECTED, ["cleanup", "activate", "shutdown", "disconnect"]),
+        (S.CONNECTING, []),
+        (S.ACTIVE, ["deactivate", "shutdown"]),
+        (S.FINALIZED, []),
         (
-            NodeState.CONFIGURING,
+            S.CONFIGURING,
             ["transition_success", "transition_failure", "transition_error"],
         ),
     ],
@@ -492,7 +476,7 @@ def test_available_transitions_are_what_can_be_asked_for_here(
 
 
 def test_nobody_outside_may_finish_a_transition() -> None:
-    machine = node_in(NodeState.CONFIGURING).machine
+    machine = node_in(S.CONFIGURING).machine
     assert machine.resolve(10) is None
     assert machine.resolve(0, "transition_success") is None
 
@@ -525,11 +509,11 @@ class Walk(RuleBasedStateMachine):
     def finish(self, outcome: CallbackOutcome) -> None:
         before = self.state
         self.node.finish(outcome)
-        assert self.state is FINISHED.get((before, outcome), NodeState.ERRORPROCESSING)
+        assert self.state is FINISHED.get((before, outcome), S.ERRORPROCESSING)
 
     @invariant()
     def changes_form_a_chain(self) -> None:
-        goals = [NodeState.UNCONFIGURED, *(change.goal for change in self.node.changes)]
+        goals = [S.UNCONFIGURED, *(change.goal for change in self.node.changes)]
         assert [change.start for change in self.node.changes] == goals[:-1]
         assert goals[-1] is self.state
 
@@ -545,7 +529,7 @@ class Walk(RuleBasedStateMachine):
     @invariant()
     def the_gate_is_open_exactly_while_it_is_active(self) -> None:
         gate = [each for each in self.node.did if each in ("open", "close")]
-        assert (gate[-1:] == ["open"]) == (self.state is NodeState.ACTIVE)
+        assert (gate[-1:] == ["open"]) == (self.state is S.ACTIVE)
 
     @invariant()
     def what_is_available_is_what_is_taken(self) -> None:

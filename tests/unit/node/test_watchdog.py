@@ -71,21 +71,6 @@ def added(dog: Watchdog, name: str) -> Node:
     return node
 
 
-def test_callbacks_are_not_watched_while_an_async_transition_is_under_way(
-    dog: Watchdog, sign: Sign
-) -> None:
-    node = added(dog, "/camera")
-    dog.begin(None)
-    node.become(NodeState.CONFIGURING)
-    dog.end()
-    dog.begin(None)
-    assert not sign.busy
-    node.become(NodeState.INACTIVE_DISCONNECTED)
-    dog.end()
-    dog.begin(None)
-    assert sign.busy
-
-
 def test_of_two_transitions_both_must_end(dog: Watchdog, sign: Sign) -> None:
     one, other = added(dog, "/one"), added(dog, "/other")
     dog.begin(None)
