@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data, qos_profile_services_default
 from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
@@ -147,25 +146,6 @@ def test_an_endpoint_that_listens_nowhere_is_refused(
     with pytest.raises(MiddlewareError) as refused:
         create_subscription(make_node("n"), String, "/a", ignore, QosProfile(), unique=strictly)
     assert "strictly_required: the RMW lists no network flow endpoint for it;" in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs"),
-    [
-        (
-            QosProfile(
-                depth=5,
-                reliability=Reliability.BEST_EFFORT,
-                liveliness=Liveliness.SYSTEM_DEFAULT,
-            ),
-            qos_profile_sensor_data,
-        ),
-        (QosProfile(liveliness=Liveliness.SYSTEM_DEFAULT), qos_profile_services_default),
-    ],
-)
-def test_presets_of_ros_convert_both_ways(ours: QosProfile, theirs: object) -> None:
-    assert from_rclpy(theirs) == ours
-    assert to_rclpy(ours) == theirs
 
 
 def test_every_policy_survives_the_way_there_and_back() -> None:

@@ -242,11 +242,6 @@ def test_an_idle_connection_costs_no_thread_of_ours_and_no_time(
         wait_until(idle)
 
 
-# Static endpoint discovery ------------------------------------------------------------------------
-
-# Discovery server ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tcp", [True, False])
 def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_them(
     fresh_domain: int, spun: Node, wait_until: WaitUntil, ports: list[int], tcp: bool

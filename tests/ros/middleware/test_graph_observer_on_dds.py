@@ -15,15 +15,12 @@ import pytest
 import rclpy
 from managed_node import ManagedNode
 from rcl_interfaces.srv import SetParameters
-from rclpy.action import ActionServer
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from test_msgs.action import Fibonacci
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
-from lifecycle.middleware.discovery.prober import ANSWER_S
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.rcl.graph_queries import endpoints_of
@@ -142,18 +139,6 @@ def test_what_is_made_anew_under_one_name_and_type_is_shown_as_it_is(
     assert nodes(observer) == before
 
 
-def test_two_nodes_of_one_name_count_twice(
-    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
-) -> None:
-    make_node("twin")
-    make_node("twin")
-    wait_until(
-        lambda: (
-            nodes(observer).get("/twin") == ObservedNode(full_name="/twin", count=2, managed=False)
-        )
-    )
-
-
 def named(observer: GraphObserver, name: str) -> int:
     """How many nodes of a name the RMW has."""
     return observer.node.get_node_names().count(name)
@@ -251,45 +236,6 @@ def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
     wait_until(lambda: last in endpoints(observer))
     wait_until(lambda: "/leaving/get_configuration" not in observer.services_of("/leaving"))
     assert sorted(endpoints(observer), key=lambda each: each[1]) == [remap, last]
-
-
-def test_the_parts_of_an_action_server_show_as_one_endpoint(
-    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
-) -> None:
-    server = ActionServer(make_node("dock"), Fibonacci, "~/go", lambda _: Fibonacci.Result())
-    expected = (EndpointKind.ACTION_SERVER, "/dock", "/dock/go", "test_msgs/action/Fibonacci")
-    wait_until(lambda: endpoints(observer) == [expected])
-    server.destroy()
-
-
-def test_nodes_named_as_a_tool_are_shown_and_the_observer_itself_is_not(
-    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
-) -> None:
-    make_node("launch_ros_42").create_publisher(String, "/a", 10)
-    wait_until(lambda: "/launch_ros_42" in nodes(observer))
-    wait_until(
-        lambda: (
-            [each[:3] for each in endpoints(observer)]
-            == [(EndpointKind.PUBLISHER, "/launch_ros_42", "/a")]
-        )
-    )
-    assert list(nodes(observer)) == ["/launch_ros_42"]
-
-
-def test_a_flow_participant_shows_as_its_hidden_node(
-    observer: GraphObserver, domain_id: int, wait_until: WaitUntil
-) -> None:
-    with FlowParticipant("_camera_flow_0", "/robot", domain_id) as participant:
-        participant.create_publisher(String, "/robot/video", QosProfile())
-        expected = (
-            EndpointKind.PUBLISHER,
-            "/robot/_camera_flow_0",
-            "/robot/video",
-            "std_msgs/msg/String",
-        )
-        wait_until(lambda: endpoints(observer) == [expected])
-        wait_until(lambda: list(nodes(observer)) == ["/robot/_camera_flow_0"])
-    wait_until(lambda: endpoints(observer) == [])
 
 
 def test_the_guard_wakes_for_a_new_publisher_and_again_when_it_goes(
@@ -397,19 +343,3 @@ def test_destroying_twice_is_harmless(domain_id: int) -> None:
     observer.destroy()
     observer.destroy()
     assert not [each for each in threading.enumerate() if each.name == "graph-guard"]
-
-
-def _settled_after_s(observer: GraphObserver, began_s: float) -> float:
-    while True:
-        observer.snapshot()
-        if (left_s := observer.settling.left_s()) <= 0:
-            return time.monotonic() - began_s
-        time.sleep(min(left_s, 0.005))
-
-
-def test_who_was_there_before_is_waited_for(fresh_domain: int) -> None:
-    with a_node(fresh_domain, "before"):
-        began_s = time.monotonic()
-        with GraphObserver(fresh_domain) as observer:
-            assert _settled_after_s(observer, began_s) >= ANSWER_S
-            assert "/before" in nodes(observer)

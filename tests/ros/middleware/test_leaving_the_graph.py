@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
-from fast_dds_words import without_fast_dds
 
 from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from lifecycle.middleware.rcl.graph import GraphObserver
@@ -69,37 +67,6 @@ def names(observer: GraphObserver) -> list[str]:
 def domains_own(files: Iterable[str]) -> set[str]:
     """Leave out ports 7000–7399: free ones are taken at once by processes of every domain."""
     return {name for name in files if not re.search(r"port7[0-3]\d\d(?!\d)", name)}
-
-
-def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
-    observer: GraphObserver, wait_until: WaitUntil
-) -> None:
-    with start() as process:
-        wait_until(lambda: names(observer) == ["/managed", "/plain"])
-        ours = owned_by([process.pid])
-        _, errors = process.communicate("leave\n", timeout=30)
-    assert (process.returncode, without_fast_dds(errors)) == (5, [])
-    # Told by the leaving process: an unannounced death would show after 20 s.
-    wait_until(lambda: names(observer) == [], timeout_s=10)
-    # The segment went with its owner; a port goes with the last that has it, the observer.
-    assert ours
-    assert not [name for name in ours if "port" not in name and Path("/dev/shm", name).exists()]
-    observer.destroy()
-    # Of two that leave at once neither may take itself for the last: then it is unused, and swept,
-    # perhaps by a supervisor that ends meanwhile in another test process.
-    left = {name for name in domains_own(ours) if Path("/dev/shm", name).exists()}
-    sweep(within_s=1.0)
-    assert not any(Path("/dev/shm", name).exists() for name in left), users_of(left)
-
-
-def users_of(names: Iterable[str]) -> list[str]:
-    """Return pid and command line of each process that has one of these files in its memory."""
-    found = []
-    for maps in Path("/proc").glob("[0-9]*/maps"):
-        with contextlib.suppress(OSError):
-            if any(f"/{name}\n" in maps.read_text() for name in names):
-                found.append(f"{maps.parent.name} {(maps.parent / 'cmdline').read_bytes()!r}")
-    return found
 
 
 def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> None:

@@ -20,7 +20,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from lifecycle.codec import to_json
-from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.middleware.services.service_calls import ServiceUnansweredError
@@ -32,7 +31,6 @@ Serve = Callable[..., None]
 WaitUntil = Callable[..., None]
 
 BOUND_S = 30.0
-UNREADABLE = "cannot read the configuration of '/n': Object missing required field `identity`"
 CONFIGURATION = configuration("/n")
 
 
@@ -96,29 +94,6 @@ def slow(context: rclpy.Context, serve: Serve) -> Slow:
     node = Slow("slow", context=context, enable_rosout=False)
     serve(node)
     return node
-
-
-def test_a_managed_node_is_driven_through_its_states(clients: NodeClients, slow: Slow) -> None:
-    async def drive() -> list[object]:
-        return [
-            await clients.get_state("/slow"),
-            await clients.get_available_transitions("/slow"),
-            await clients.change_state("/slow", "configure", timeout_s=BOUND_S),
-            await clients.change_state("/slow", "activate", timeout_s=BOUND_S),
-            await clients.get_state("/slow"),
-            await clients.change_state("/slow", "cleanup", timeout_s=BOUND_S),
-            await clients.get_state("/slow"),
-        ]
-
-    assert run(drive()) == [
-        "unconfigured",
-        ("configure", "shutdown"),
-        True,
-        True,
-        "active",
-        False,
-        "active",
-    ]
 
 
 def test_a_transition_that_fails_is_told_apart_from_one_that_succeeds(
@@ -197,19 +172,6 @@ def test_a_server_that_cannot_be_matched_does_not_hide_the_one_that_answers(
     assert not any(each.service_is_ready() for each in clients._calls._clients.values())
 
 
-def test_a_call_waits_for_a_node_that_comes_later(
-    clients: NodeClients, context: rclpy.Context, serve: Serve
-) -> None:
-    async def come_late() -> str:
-        asked = asyncio.ensure_future(clients.get_state("/late", timeout_s=BOUND_S))
-        await asyncio.sleep(0.2)
-        assert not asked.done()
-        serve(Slow("late", context=context, enable_rosout=False))
-        return await asked
-
-    assert run(come_late()) == "unconfigured"
-
-
 def test_a_request_that_may_be_repeated_is_until_it_is_answered(
     clients: NodeClients,
     make_node: Callable[..., Node],
@@ -234,41 +196,6 @@ def test_a_request_that_may_be_repeated_is_until_it_is_answered(
     assert run(clients.get_configuration("/n", timeout_s=BOUND_S)) == CONFIGURATION
     assert not [each for each in clients._calls._clients.values() if each._pending_requests]
     wait_until(lambda: len(asked) > 1)
-
-
-@pytest.mark.parametrize(
-    ("success", "message", "expected"),
-    [
-        (
-            False,
-            "not declared yet",
-            "cannot read the configuration of '/n': it says 'not declared yet'",
-        ),
-        (True, "{}", f"{UNREADABLE}; the node may run another version of lifecycle"),
-    ],
-)
-def test_a_configuration_that_cannot_be_used_says_why(
-    clients: NodeClients,
-    make_node: Callable[..., Node],
-    serve: Serve,
-    wait_until: WaitUntil,
-    observer: GraphObserver,
-    success: bool,
-    message: str,
-    expected: str,
-) -> None:
-    node = make_node("n")
-
-    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = success, message
-        return response
-
-    node.create_service(Trigger, "~/get_configuration", answer)
-    serve(node)
-    wait_until(lambda: observer.offers("/n", "/n/get_configuration"))
-    with pytest.raises(MiddlewareError) as refused:
-        run(clients.get_configuration("/n", timeout_s=BOUND_S))
-    assert str(refused.value) == expected
 
 
 def test_a_node_without_the_interface_has_no_configuration(
