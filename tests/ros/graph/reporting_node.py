@@ -1,6 +1,6 @@
 """A node in a process of its own that reports to the graph: joined, heartbeats, and SIGTERM: left.
 
-    python reporting_node.py NAME TOPIC
+    python -m tests.ros.graph.reporting_node NAME TOPIC
 
 It serves `~/get_configuration` with one publisher of TOPIC, and makes it on the ordinary graph too.
 """
@@ -21,7 +21,8 @@ from lifecycle import codec
 from lifecycle.graph.reporter import GraphReporter
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.process.teardown import leave_and_exit
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.observation import EndpointReport
+from tests.builders import configuration
 
 
 class ReportingNode:
@@ -30,27 +31,15 @@ class ReportingNode:
     def __init__(self, node: Node, topic: str) -> None:
         self.node = node
         self.name = node.get_fully_qualified_name()
-        self.configuration = NodeConfiguration(
-            identity=Identity(machine_id="m", process_id=1, node_id=self.name),
-            name=self.name,
-            state="inactive",
-            connected=True,
-            rmw="rmw_fastrtps_cpp",
-            transports=("shm", "udpv4"),
-            serializations=("cdr",),
-            paradigms=("publish-subscribe",),
-            endpoints=(
-                EndpointReport(
-                    kind=EndpointKind.PUBLISHER,
-                    name="out",
-                    resolved=topic,
-                    type="std_msgs/msg/String",
-                    mapped=True,
-                    matched=0,
-                ),
-            ),
-            checksum="1",
+        report = EndpointReport(
+            kind=EndpointKind.PUBLISHER,
+            name="out",
+            resolved=topic,
+            type="std_msgs/msg/String",
+            mapped=True,
+            matched=0,
         )
+        self.configuration = configuration(self.name, report, checksum="1")
         self.asked = 0
         node.create_publisher(String, topic, 1)
         node.create_service(Trigger, "~/get_configuration", self._serve)

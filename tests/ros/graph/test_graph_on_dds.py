@@ -30,16 +30,17 @@ from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.plan.build import build_plan
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.observation import EndpointReport
 from lifecycle.verify.outcome import Outcome
-from tests.ros.supervisor.running import pair, up
+from tests.builders import configuration
+from tests.ros.supervisor.running import ROOT, pair, up
 from tests.shared_memory import owned_by
 
 LIMIT_S = 30.0
 
 WaitUntil = Callable[..., None]
 
-PROCESS = Path(__file__).with_name("reporting_node.py")
+PROCESS = "tests.ros.graph.reporting_node"
 
 
 @contextlib.contextmanager
@@ -70,7 +71,7 @@ def _sweep() -> Iterator[None]:
 @contextlib.contextmanager
 def process(name: str, topic: str) -> Iterator[subprocess.Popen[str]]:
     started = subprocess.Popen(
-        [sys.executable, str(PROCESS), name, topic], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", PROCESS, name, topic], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     try:
         assert started.stdout is not None
@@ -211,19 +212,8 @@ def test_a_node_of_ours_that_tells_no_events_is_read_again_when_its_connections_
         report = EndpointReport(
             kind=EndpointKind.PUBLISHER, name="t", resolved=topic, type="std_msgs/msg/String"
         )
-        configuration = NodeConfiguration(
-            identity=Identity(machine_id="m", process_id=1, node_id="/quiet"),
-            name="/quiet",
-            state="active",
-            connected=True,
-            rmw="rmw_fastrtps_cpp",
-            transports=(),
-            serializations=(),
-            paradigms=(),
-            endpoints=(report,),
-            checksum=topic,
-        )
-        response.success, response.message = True, codec.to_json(configuration).decode()
+        told = configuration("/quiet", report, state="active", checksum=topic)
+        response.success, response.message = True, codec.to_json(told).decode()
         return response
 
     node.create_service(Trigger, "~/get_configuration", answer)

@@ -10,12 +10,11 @@ import rclpy
 from rclpy.action import ActionServer
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from lifecycle import LifecycleNode, on_message, on_timer
+from lifecycle import LifecycleNode, on_message
 
 
 class Good(LifecycleNode):
@@ -28,21 +27,6 @@ class Echo(LifecycleNode):
     @on_message("in")
     def receive(self, message: String) -> None:
         self.publisher("out").publish(message)
-
-
-class Restless(LifecycleNode):
-    """Has another configuration at each tick, of 4 kB, and says how many it has had."""
-
-    def on_configure(self) -> None:
-        self.count = 0
-        if not self.has_parameter("text"):
-            self.declare_parameter("text", "")
-
-    @on_timer(period_s=0.002)
-    def tick(self) -> None:
-        self.count += 1
-        self.set_parameters([Parameter("text", value=f"{self.count} " + "x" * 4000)])
-        self.publisher("out").publish(String(data=str(self.count)))
 
 
 class Raising(LifecycleNode):
@@ -77,11 +61,6 @@ class BlockingConstructor(LifecycleNode):
         super().__init__()
         print("constructing", file=sys.stderr, flush=True)
         time.sleep(3600)
-
-
-class Failing(LifecycleNode):
-    def on_configure(self) -> None:
-        raise OSError("no such camera")
 
 
 class Plain(Node):

@@ -189,28 +189,6 @@ def test_ros2_action_sees_ours_as_it_sees_others(driver: Driver, active: Active)
     driver.spin_until(lambda: servers() == [] == clients())
 
 
-def test_remapping_all_hidden_names_renames_the_action(
-    driver: Driver, active: Active, ask: Ask
-) -> None:
-    hidden = ("send_goal", "cancel_goal", "get_result", "feedback", "status")
-    remap = tuple((f"count/_action/{each}", f"tally/_action/{each}") for each in hidden)
-    node = active(
-        Counting,
-        server(resolved="/robot/tally"),
-        publisher("stop"),
-        namespace="/robot",
-        remap=remap,
-        to="",
-    )
-    for label in ("configure", "connect", "activate"):
-        assert driver.set("/robot/it", label)
-    assert node.mappings[0] == ("action_servers/count", "")
-    asking = ask("/robot/tally", node)
-    goal = asking.goal()
-    step(driver, node)
-    assert asking.result(goal) == (SUCCEEDED, [0])
-
-
 def test_remapping_some_hidden_names_is_refused_at_connect(driver: Driver, active: Active) -> None:
     remap = (("count/_action/send_goal", "tally/_action/send_goal"),)
     node = active(Counting, server(), publisher("stop"), remap=remap, to="configure")

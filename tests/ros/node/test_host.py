@@ -16,7 +16,6 @@ from host_process import HostProcess, driver_in, hosted
 from msgspec.structs import replace
 from planning import publisher, subscription
 from rclpy.action import ActionClient
-from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 
 from lifecycle.errors import BringUpError
@@ -134,37 +133,6 @@ def test_a_command_to_a_node_that_is_not_here_is_answered(start: Start) -> None:
         False,
         "cannot find node '/two'; this process hosts /one",
     )
-
-
-def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(start: Start) -> None:
-    host = start(hosted("one", "Failing"))
-    host.until("ready")
-    reply = host.do("/one", CONFIGURE)
-    assert (reply.ok, reply.state) == (False, "unconfigured")
-    assert reply.error == "/one: on_configure raised OSError: no such camera"
-    assert 'raise OSError("no such camera")' in host.log.read_text()
-
-
-def test_a_supervisor_that_does_not_read_holds_up_no_callback(
-    start: Start, fresh_domain: int
-) -> None:
-    host = start(hosted("one", "Restless", publisher("out")))
-    host.until("ready")
-    for operation in (CONFIGURE, CONNECT, ACTIVATE):
-        assert host.do("/one", operation).ok
-    ticks: list[int] = []
-    with driver_in(fresh_domain) as driver:
-        driver.node.create_subscription(String, "/out", lambda m: ticks.append(int(m.data)), 10)
-        driver.spin_until(
-            lambda: ticks and ticks[-1] > 300
-        )  # a socket has room for some 40 of them
-    asked = host.ask("/one", Operation.DEACTIVATE)
-    reply, before = host.until("reply")
-    assert (reply.id, reply.ok) == (asked, True)
-    told = [each.configuration for each in before if each.configuration is not None]
-    assert len(told) < 200  # of what was not read, only the newest
-    last = next(each.value for each in told[-1].parameters or () if each.name == "text")
-    assert int(str(last).partition(" ")[0]) >= ticks[-1]
 
 
 BLOCKED = (

@@ -471,17 +471,6 @@ def test_keep_going_reports_the_death_and_the_verdict_and_goes_on_but_is_no_succ
     assert "    + violated graph.missing-node: " in history
 
 
-def test_a_grandchild_that_escaped_into_its_own_session_is_ended_too(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    manifest = pair(tmp_path, fresh_domain, misbehave="configure:fork")
-    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
-        assert run.finish() == ExitCode.OK
-        notices = [each["message"] for each in run.of_kind("notice")]
-        assert any(each.startswith("ended processes that were left behind") for each in notices)
-        run.assert_nothing_left()
-
-
 def test_status_and_down_talk_to_a_running_supervisor(tmp_path: Path, fresh_domain: int) -> None:
     manifest = pair(tmp_path, fresh_domain)
     with up(manifest, runtime=tmp_path) as run:
@@ -748,17 +737,6 @@ def test_what_is_in_the_place_of_the_run_directory_is_named_and_left_alone(
         before.st_mode,
         before.st_mtime,
     )
-
-
-def test_a_run_directory_and_its_socket_are_there_while_a_system_is_and_not_longer(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    path = tmp_path / "lifecycle" / f"pair@{fresh_domain}"
-    with up(pair(tmp_path, fresh_domain), "--until", "connected", runtime=tmp_path) as run:
-        run.until("run")
-        assert path.is_dir()
-        assert run.finish() == ExitCode.OK
-        assert list(path.parent.iterdir()) == []
 
 
 def test_systemd_is_notified_once_the_system_is_verified_and_active(
