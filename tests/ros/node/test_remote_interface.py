@@ -18,6 +18,7 @@ from lifecycle import LifecycleNode, codec, on_message
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import NodeConfiguration
+from tests.ros.stranger import stranger
 
 UDP = "udpv4://127.0.0.1"
 
@@ -206,10 +207,7 @@ def test_a_supervisor_is_told_of_each_change_of_the_configuration(
     host.until("ready")
     for operation in (Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE):
         assert host.do("/it", operation).ok
-    context = rclpy.Context()
-    context.init(args=[], domain_id=fresh_domain)
-    peer = rclpy.create_node("peer", context=context)
-    try:
+    with stranger(fresh_domain, "peer") as peer:
         sender = peer.create_publisher(String, "/in", 10)
         told = until(host, lambda c: c.endpoints[0].matched == 1)
         checksum = told.checksum
@@ -218,10 +216,6 @@ def test_a_supervisor_is_told_of_each_change_of_the_configuration(
         how = ParticipantConnections(urls=(UDP,))
         host.ask("/it", Operation.CONNECT_TO, connection="net", connections=how)
         assert until(host, lambda c: len(c.connections) == 2).checksum != checksum
-    finally:
-        peer.destroy_node()
-        context.try_shutdown()
-        context.destroy()
     host.hang_up()
     assert host.wait() == 0
 

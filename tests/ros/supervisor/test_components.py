@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, verb, write
+from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, up, verb, write
 
 FOLDER = ROOT / "tests" / "ros" / "supervisor" / "composition"
 VARIABLES = {"PYTHONPATH": str(FOLDER)}
@@ -86,9 +86,8 @@ def test_components_in_a_container_of_others_come_and_go(
     nodes["hearer"]["run"]["extra_arguments"] = {"use_intra_process_comms": True}
     others = {"run": {"attach": True}, **OPEN}
     manifest = system(tmp_path, fresh_domain, pool=others, **nodes)
-    run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
     assert pool.stdout is not None
-    try:
+    with up(manifest, runtime=tmp_path, variables=VARIABLES) as run:
         run.until("system", reached="active")
         run.assert_gate_held()
         loaded = {pool.stdout.readline() for _ in range(2)}
@@ -107,8 +106,6 @@ def test_components_in_a_container_of_others_come_and_go(
         unloaded = {pool.stdout.readline() for _ in range(2)}
         assert unloaded == {"unloaded /robot/talker\n", "unloaded /hearer\n"}
         assert pool.poll() is None
-    finally:
-        run.close()
 
 
 @pytest.mark.thorough
@@ -118,8 +115,7 @@ def test_what_a_container_did_counts_where_its_reply_is_lost(
     nodes = talker_and_hearer("container", tmp_path / "values.yaml")
     ours = {"run": {"command": [*CONTAINER, "mute"]}, **OPEN}
     manifest = system(tmp_path, fresh_domain, container=ours, **nodes)
-    run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
-    try:
+    with up(manifest, runtime=tmp_path, variables=VARIABLES) as run:
         run.until("system", reached="active")
         again = verb("restart", "composed", "talker", runtime=tmp_path)
         assert again.returncode == ExitCode.OK, again.stderr
@@ -128,16 +124,13 @@ def test_what_a_container_did_counts_where_its_reply_is_lost(
         assert talked == [f"{did} /robot/talker" for did in ("loaded", "unloaded", "loaded")]
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.OK, run.said()
-    finally:
-        run.close()
 
 
 @pytest.mark.thorough
 def test_a_container_of_ours_takes_its_components_along(tmp_path: Path, fresh_domain: int) -> None:
     nodes = talker_and_hearer("container", tmp_path / "values.yaml")
     manifest = system(tmp_path, fresh_domain, container=OURS, **nodes)
-    run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
-    try:
+    with up(manifest, runtime=tmp_path, variables=VARIABLES) as run:
         run.until("system", reached="active")
         again = verb("restart", str(manifest), "container", runtime=tmp_path)
         assert again.returncode == ExitCode.OK, again.stderr
@@ -147,8 +140,6 @@ def test_a_container_of_ours_takes_its_components_along(tmp_path: Path, fresh_do
         first = run.verdict["findings"][0]
         assert (first["rule"], first["subject"]) == ("run.process-died", "/container")
         run.assert_nothing_left()
-    finally:
-        run.close()
 
 
 @pytest.mark.parametrize(
@@ -166,10 +157,7 @@ def test_what_cannot_be_loaded_ends_the_bring_up_with_the_reason(
 ) -> None:
     node = component(plugin, container, timeouts={"start_s": 3.0})
     manifest = system(tmp_path, fresh_domain, container=OURS, node=node)
-    run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
-    try:
+    with up(manifest, runtime=tmp_path, variables=VARIABLES) as run:
         assert run.finish() == ExitCode.BRING_UP_FAILED
         assert said in str(run.verdict), run.verdict
         run.assert_nothing_left()
-    finally:
-        run.close()

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from tests.ros.middleware.free_ports import first_port
+from tests.ros.stranger import stranger
 from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
 
 pytestmark = pytest.mark.thorough
@@ -54,13 +54,8 @@ def open_ports() -> Iterator[set[str]]:
 @pytest.fixture
 def bystander(fresh_domain: int, open_ports: set[str]) -> Iterator[Node]:
     """A node of somebody else's in the domain, which knows nothing of the system."""
-    context = rclpy.Context()
-    context.init(args=[], domain_id=fresh_domain)
-    node = Node("_bystander", context=context, enable_rosout=False)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
-    context.destroy()
+    with stranger(fresh_domain, "_bystander") as node:
+        yield node
 
 
 def kill(run: Up, process: str) -> float:
@@ -179,15 +174,12 @@ def test_nobody_keeps_others_from_opening_shared_memory(tmp_path: Path, fresh_do
     noted, locks = tmp_path / "leases", tmp_path / "locks"
     variables = {"PYTHONPATH": str(tmp_path), "LEASES": str(noted), "LOCKS": str(locks)}
     manifest = pair(tmp_path, fresh_domain, edit={"restart": "on-failure"})
-    run = Up(manifest, runtime=tmp_path, variables=variables)
-    try:
+    with up(manifest, runtime=tmp_path, variables=variables) as run:
         run.until("system", reached="active")
         kill(run, "talker")
         run.until("restarted")
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.OK
-    finally:
-        run.close()
     assert locks.exists(), "nobody has looked"
     assert not noted.exists()
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import gc
 import json
 import os
 import signal
@@ -16,14 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.services.clients import NodeClients
 from tests.ros.faults.system import BARE_DDS, FOREIGN
+from tests.ros.stranger import ask, stranger
 from tests.ros.supervisor.running import (
     BOUND_S,
     LIMITS,
@@ -46,13 +42,7 @@ _BASE = {
 
 def change(domain_id: int, node: str, transition: str) -> bool:
     """Ask for a transition as anybody may; whether it succeeded."""
-    observer = GraphObserver(domain_id)
-    clients = NodeClients(observer)
-    try:
-        return asyncio.run(clients.change_state(node, transition, timeout_s=20.0))
-    finally:
-        clients.destroy()
-        observer.destroy()
+    return bool(ask(domain_id, lambda each: each.change_state(node, transition, timeout_s=20.0)))
 
 
 def activated(run: Up) -> list[str]:
@@ -108,36 +98,16 @@ def test_a_node_whose_own_code_activates_it_is_refused_while_the_gate_is_closed(
         run.assert_nothing_left()
 
 
-class Publishers:
-    """Publishers that nobody declared."""
-
-    def __init__(self) -> None:
-        self._all = contextlib.ExitStack()
-
-    def __call__(self, domain_id: int) -> Node:
-        context = rclpy.Context()
-        context.init(args=[], domain_id=domain_id)
-        self._all.callback(gc.collect)
-        self._all.callback(context.destroy)
-        self._all.callback(context.try_shutdown)
-        node = Node("intruder", context=context, enable_rosout=False)
-        self._all.callback(node.destroy_node)
+@contextlib.contextmanager
+def a_publisher(domain_id: int) -> Iterator[Node]:
+    """Have a publisher that nobody declared."""
+    with stranger(domain_id) as node:
         node.create_publisher(String, "chatter", 10)
-        return node
-
-    def leave(self) -> None:
-        self._all.close()
-
-
-@pytest.fixture
-def make_publisher() -> Iterator[Publishers]:
-    publishers = Publishers()
-    yield publishers
-    publishers.leave()
+        yield node
 
 
 def test_who_appears_while_a_chain_is_activated_keeps_its_last_node_inactive(
-    tmp_path: Path, fresh_domain: int, make_publisher: Publishers
+    tmp_path: Path, fresh_domain: int
 ) -> None:
     """The last one would be activated on a verdict that is seconds old."""
     edit = {
@@ -149,9 +119,9 @@ def test_who_appears_while_a_chain_is_activated_keeps_its_last_node_inactive(
     }
     with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("log", line="about to wait in activate")
-        make_publisher(fresh_domain)
-        # The step ends by itself: until then discovery has shown the newcomer to everybody.
-        assert run.finish() == ExitCode.VIOLATED
+        with a_publisher(fresh_domain):
+            # The step ends by itself: until then discovery has shown the newcomer to everybody.
+            assert run.finish() == ExitCode.VIOLATED
         assert activated(run) == ["/talker"]
         reason = run.verdict["run"]["reason"]
         assert reason.startswith("the system changed before every node was activated; ")
@@ -160,7 +130,7 @@ def test_who_appears_while_a_chain_is_activated_keeps_its_last_node_inactive(
 
 
 def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
-    tmp_path: Path, fresh_domain: int, make_publisher: Publishers
+    tmp_path: Path, fresh_domain: int
 ) -> None:
     """Programming takes seconds: the verdict that it was begun on is none of now."""
     begun, go = tmp_path / "begun", tmp_path / "go"
@@ -173,18 +143,17 @@ def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
     tool.chmod(0o755)
     variables = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     manifest = pair(tmp_path, fresh_domain)
-    run = Up(manifest, "--program", "nft", runtime=tmp_path, variables=variables)
-    try:
+    with up(manifest, "--program", "nft", runtime=tmp_path, variables=variables) as run:
         run.until("system", reached="verified")
         until(begun.exists)
         assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
-        node = make_publisher(fresh_domain)
-        # They have found each other both ways, or are about to.
-        until(lambda: node.count_subscribers("chatter") == 1)
-        until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
-        time.sleep(0.3)
-        go.touch()
-        assert run.finish() == ExitCode.VIOLATED
+        with a_publisher(fresh_domain) as node:
+            # They have found each other both ways, or are about to.
+            until(lambda: node.count_subscribers("chatter") == 1)
+            until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
+            time.sleep(0.3)
+            go.touch()
+            assert run.finish() == ExitCode.VIOLATED
         assert activated(run) == []
         assert run.of_kind("gate") == []
         assert "active" not in {each["state"] for each in run.of_kind("node")}
@@ -192,8 +161,6 @@ def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
         assert reason.startswith("the system changed before every node was activated; ")
         assert "/intruder (graph.undeclared-node)" in reason
         run.assert_nothing_left()
-    finally:
-        run.close()
 
 
 @pytest.mark.parametrize(
@@ -230,7 +197,7 @@ def test_a_participant_that_gets_no_cpu_time_is_waited_for(
 
 @pytest.mark.parametrize("order", ["resume", "restart"])
 def test_who_appears_while_a_system_is_activated_again_has_it_held_and_not_ended(
-    tmp_path: Path, fresh_domain: int, make_publisher: Publishers, order: str
+    tmp_path: Path, fresh_domain: int, order: str
 ) -> None:
     go = tmp_path / "go"
     go.touch()
@@ -245,28 +212,30 @@ def test_who_appears_while_a_system_is_activated_again_has_it_held_and_not_ended
             run.until("system", reached="paused")
         since = run.catch_up()
         go.unlink()
-        with ordered(order, tmp_path) as told:
-            run.met("log", since=since, line="about to wait in activate")
-            node = make_publisher(fresh_domain)
-            until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
-            time.sleep(0.3)
-            go.touch()
-            _, said = told.communicate(timeout=BOUND_S)
-        assert told.returncode == ExitCode.VIOLATED
-        assert said.startswith(
-            "cannot activate: the system changed before every node was activated"
-        )
-        assert "graph.undeclared-node" in said
-        run.met("notice", since=since, message="the gate closed again: /talker is deactivated")
-        status = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
-        assert status["phase"] == ("paused" if order == "resume" else "held")
-        assert {each["state"] for each in status["nodes"]} == {"inactive"}
-        run.catch_up()
-        sent = [each["node"] for each in run.events[since:] if each.get("operation") == "activate"]
-        assert sent == ["/talker"]
+        with contextlib.ExitStack() as present:
+            with ordered(order, tmp_path) as told:
+                run.met("log", since=since, line="about to wait in activate")
+                node = present.enter_context(a_publisher(fresh_domain))
+                until(lambda: any("lifecycle_observer" in each for each in node.get_node_names()))
+                time.sleep(0.3)
+                go.touch()
+                _, said = told.communicate(timeout=BOUND_S)
+            assert told.returncode == ExitCode.VIOLATED
+            assert said.startswith(
+                "cannot activate: the system changed before every node was activated"
+            )
+            assert "graph.undeclared-node" in said
+            run.met("notice", since=since, message="the gate closed again: /talker is deactivated")
+            status = json.loads(verb("status", "pair", "--format", "json", runtime=tmp_path).stdout)
+            assert status["phase"] == ("paused" if order == "resume" else "held")
+            assert {each["state"] for each in status["nodes"]} == {"inactive"}
+            run.catch_up()
+            sent = [
+                each["node"] for each in run.events[since:] if each.get("operation") == "activate"
+            ]
+            assert sent == ["/talker"]
 
         # As for one that is violated at once, the run goes on: it can be resumed later.
-        make_publisher.leave()
         until(lambda: verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK)
         run.until("system", reached="active")
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK

@@ -17,7 +17,7 @@ from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
 from lifecycle.run_directory import RUN_VARIABLE
-from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
+from tests.ros.supervisor.running import ROOT, command, environment, marked, pair, up
 from tests.shared_memory import owned_by
 
 pytestmark = pytest.mark.thorough
@@ -55,16 +55,13 @@ def test_the_shared_memory_of_another_pid_namespace_is_left_alone(
     publisher = node.create_publisher(String, "alive", 10)
     owned = owned_by([os.getpid()])
     assert in_shared_memory(owned) == owned != set()
-    run = Up(
+    with up(
         pair(tmp_path, domain_id, edit=OPEN),
         *("--stop-after", "0"),
         runtime=tmp_path,
         through=ELSEWHERE,
-    )
-    try:
+    ) as run:
         assert run.finish() == ExitCode.OK, run.events[-3:]
-    finally:
-        run.close()
     # What tests before this one left may be removed, and is named then.
     said = " ".join(each["message"] for each in run.of_kind("notice"))
     assert not [each for each in owned if each in said]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import re
 import signal
@@ -14,20 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import ExitCode
+from tests.ros.stranger import stranger
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
 from tests.ros.supervisor.test_parameters import ARM
-
-Intruders = Callable[[int], Callable[[], None]]
 
 
 def requests(run: Up, since: int) -> list[tuple[str, str]]:
@@ -98,27 +94,34 @@ def test_a_paused_system_is_silent_and_resumes_only_through_the_gate(
         run.assert_nothing_left()
 
 
-def test_a_paused_system_that_is_not_ok_stays_paused(
-    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
+def test_what_is_paused_or_restarted_stays_at_the_gate_of_a_system_that_is_not_ok(
+    tmp_path: Path, fresh_domain: int
 ) -> None:
     with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
         run.until("system", reached="active")
         assert verb("pause", "pair", runtime=tmp_path).returncode == ExitCode.OK
         run.until("system", reached="paused")
         begun = len(run.events)
-        intruder = make_intruder(fresh_domain)
-        run.until_found("graph.undeclared-node", since=begun)
-        refused = verb("resume", "pair", runtime=tmp_path)
-        assert refused.returncode == ExitCode.VIOLATED
-        assert refused.stderr.startswith("cannot activate: the verdict is violated\n")
-        assert "graph.undeclared-node" in refused.stderr
-        assert phases(tmp_path)[0] == "paused"
-        run.until("notice")
-        assert requests(run, begun) == []
-
-        intruder()
+        with stranger(fresh_domain):
+            run.until_found("graph.undeclared-node", since=begun)
+            refused = verb("resume", "pair", runtime=tmp_path)
+            assert refused.returncode == ExitCode.VIOLATED
+            assert refused.stderr.startswith("cannot activate: the verdict is violated\n")
+            assert "graph.undeclared-node" in refused.stderr
+            assert phases(tmp_path)[0] == "paused"
+            run.until("notice")
+            assert requests(run, begun) == []
         resume(tmp_path)
         assert phases(tmp_path)[0] == "active"
+
+        begun = run.catch_up()
+        with stranger(fresh_domain):
+            run.until_found("graph.undeclared-node", since=begun)
+            refused = verb("restart", "pair", "talker", runtime=tmp_path)
+            assert refused.returncode == ExitCode.VIOLATED
+            assert phases(tmp_path) == ("held", {"/talker": "inactive", "/listener": "active"})
+        resume(tmp_path)
+        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
 
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -136,14 +139,8 @@ class Panel:
         self.statuses: list[Any] = []
         self.diagnostics: list[Any] = []
         self._ends = contextlib.ExitStack()
-        context = rclpy.Context()
-        context.init(args=[], domain_id=domain_id)
-        self._ends.callback(gc.collect)
-        self._ends.callback(context.destroy)
-        self._ends.callback(context.try_shutdown)
-        self.node = Node("rqt_panel", context=context, enable_rosout=False)
-        self._ends.callback(self.node.destroy_node)
-        self._executor = SingleThreadedExecutor(context=context)
+        self.node = self._ends.enter_context(stranger(domain_id, "rqt_panel"))
+        self._executor = SingleThreadedExecutor(context=self.node.context)
         self._executor.add_node(self.node)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
 
@@ -261,24 +258,6 @@ def test_without_being_asked_it_only_says_how_it_is_and_nobody_says_it_in_its_pl
         )
 
 
-@pytest.fixture
-def make_intruder() -> Iterator[Callable[[int], Callable[[], None]]]:
-    """A node that nobody declared; what is returned takes it away."""
-    with contextlib.ExitStack() as whole:
-
-        def make(domain_id: int) -> Callable[[], None]:
-            context = rclpy.Context()
-            context.init(args=[], domain_id=domain_id)
-            own = whole.enter_context(contextlib.ExitStack())
-            own.callback(gc.collect)  # what a cycle holds stays in the graph until it is found
-            own.callback(context.destroy)
-            own.callback(context.try_shutdown)
-            own.callback(Node("intruder", context=context, enable_rosout=False).destroy_node)
-            return own.close
-
-        yield make
-
-
 def test_one_node_restarts_behind_the_gate_while_the_other_stays_active(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -345,22 +324,6 @@ def test_what_restarts_in_a_paused_system_stays_paused(tmp_path: Path, fresh_dom
         assert "activate" not in [operation for _, operation in requests(run, begun)]
         assert phases(tmp_path) == ("paused", {"/talker": "inactive", "/listener": "inactive"})
         assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
-
-
-def test_a_node_that_comes_back_different_waits_at_the_gate(
-    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
-) -> None:
-    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        begun = len(run.events)
-        intruder = make_intruder(fresh_domain)
-        run.until_found("graph.undeclared-node", since=begun)
-        refused = verb("restart", "pair", "talker", runtime=tmp_path)
-        assert refused.returncode == ExitCode.VIOLATED
-        assert phases(tmp_path) == ("held", {"/talker": "inactive", "/listener": "active"})
-        intruder()
-        resume(tmp_path)
-        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
 
 
 @pytest.mark.thorough
@@ -448,15 +411,12 @@ def test_a_system_on_its_way_up_takes_no_orders(tmp_path: Path, fresh_domain: in
 
 
 @pytest.mark.thorough
-def test_a_node_of_somebody_else_is_not_restarted(
-    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
-) -> None:
+def test_a_node_of_somebody_else_is_not_restarted(tmp_path: Path, fresh_domain: int) -> None:
     manifest = pair(tmp_path, fresh_domain)
     document = yaml.safe_load(manifest.read_text())
     document["nodes"]["intruder"] = {"run": {"attach": True}, "managed": False}
     manifest.write_text(yaml.safe_dump(document, sort_keys=False))
-    make_intruder(fresh_domain)
-    with up(manifest, runtime=tmp_path) as run:
+    with stranger(fresh_domain), up(manifest, runtime=tmp_path) as run:
         run.until("system", reached="active")
         refused = verb("restart", "pair", "intruder", runtime=tmp_path)
         assert refused.returncode == ExitCode.USAGE

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.msg import ParameterType
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.services.service_calls import ServiceCalls
-from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, pair, up, verb
+from tests.ros.supervisor.running import ENOUGH, ROOT, Up, pair, up, verb
 
 pytestmark = pytest.mark.thorough
 
@@ -58,24 +54,6 @@ def system(directory: Path, domain_id: int, foreign: dict[str, Any], **rest: Any
 
 
 Set = Callable[..., None]
-
-
-@pytest.fixture
-def set_parameter(fresh_domain: int) -> Iterator[Set]:
-    """Set a parameter of a node as `ros2 param set` does."""
-    with GraphObserver(fresh_domain) as observer:
-        calls = ServiceCalls(observer)
-
-        def set_it(node: str, name: str, **value: Any) -> None:
-            service = f"{node}/set_parameters"
-            given = [Parameter(name=name, value=ParameterValue(**value))]
-            answer = asyncio.run(calls.call(service, SetParameters, BOUND_S, parameters=given))
-            assert [each.successful for each in answer.results] == [True], answer
-
-        try:
-            yield set_it
-        finally:
-            calls.destroy()
 
 
 def double(value: float) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import signal
@@ -14,13 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.msg import ParameterType
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.services.service_calls import ServiceCalls
-from tests.ros.supervisor.running import BOUND_S, LIMITS, ROOT, Up, up, verb, write
+from tests.ros.supervisor.running import LIMITS, ROOT, Up, up, verb, write
 
 LATE = "tests.ros.supervisor.late_driver"
 SOON_S = 1.5
@@ -136,27 +132,8 @@ def test_a_held_driver_runs_no_callback_and_the_deadline_says_so(late: Late) -> 
         assert "none of its callbacks runs before the gate opens" in failure["message"]
 
 
-@pytest.fixture
-def set_ready(fresh_domain: int) -> Iterator[Callable[[], None]]:
-    """Set the driver's parameter as `ros2 param set` does."""
-    with GraphObserver(fresh_domain) as observer:
-        calls = ServiceCalls(observer)
-
-        def set_it() -> None:
-            value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
-            given = [Parameter(name="ready", value=value)]
-            service = "/front/driver/set_parameters"
-            answer = asyncio.run(calls.call(service, SetParameters, BOUND_S, parameters=given))
-            assert [each.successful for each in answer.results] == [True], answer
-
-        try:
-            yield set_it
-        finally:
-            calls.destroy()
-
-
 def test_a_node_waits_until_a_parameter_of_a_driver_is_set(
-    late: Late, set_ready: Callable[[], None]
+    late: Late, set_parameter: Callable[..., None]
 ) -> None:
     manifest = late.write(
         late.driver("command", "publishes:0 serves:0"), late.viewer("plain", {"parameter": "ready"})
@@ -165,7 +142,8 @@ def test_a_node_waits_until_a_parameter_of_a_driver_is_set(
         found.until("node", node="/front/driver", reach="started")
         time.sleep(1.0)
         assert late.noted("viewer started") == []
-        set_ready()
+        kind = ParameterType.PARAMETER_BOOL
+        set_parameter("/front/driver", "ready", type=kind, bool_value=True)
         set_s = time.time()
         found.until("system", reached="active")
         (began,) = late.noted("viewer started")

@@ -650,8 +650,7 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
     tmp_path: Path, fresh_domain: int, processes: int
 ) -> None:
     through = limited(f"--nproc={processes}")
-    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=through)
-    try:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=through) as run:
         assert run.process.wait(BOUND_S) == ExitCode.BRING_UP_FAILED
         last = run.said().splitlines()[-1]
         assert last.startswith(
@@ -666,8 +665,6 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
         )
         assert left_of(run.mark) == []
         assert list((tmp_path / "lifecycle").glob("*")) == []
-    finally:
-        run.close()
 
 
 @pytest.mark.thorough
@@ -675,8 +672,7 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
 def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
     tmp_path: Path, fresh_domain: int, whom: str
 ) -> None:
-    run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=limited("--nproc=4096"))
-    try:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path, through=limited("--nproc=4096")) as run:
         run.until("system", reached="active")
         run.note_segments()
         processes = marked(run.mark) if whom == "all" else [psutil.Process(run.process.pid)]
@@ -689,8 +685,6 @@ def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
         assert run.of_kind("notice") == []
         run.assert_nothing_left()
         assert list((tmp_path / "lifecycle").glob("*")) == []
-    finally:
-        run.close()
 
 
 def _foreign(path: Path) -> None:
@@ -746,8 +740,7 @@ def test_systemd_is_notified_once_the_system_is_verified_and_active(
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(BOUND_S)
         variables = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "500000"}
-        run = Up(pair(tmp_path, fresh_domain), runtime=tmp_path, variables=variables)
-        try:
+        with up(pair(tmp_path, fresh_domain), runtime=tmp_path, variables=variables) as run:
             sent: list[str] = []
             while "READY=1" not in sent:
                 sent += manager.recv(4096).decode().split("\n")
@@ -758,8 +751,6 @@ def test_systemd_is_notified_once_the_system_is_verified_and_active(
             while "STOPPING=1" not in sent:
                 sent += manager.recv(4096).decode().split("\n")
             assert run.finish() == ExitCode.OK
-        finally:
-            run.close()
 
 
 @pytest.mark.thorough

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import signal
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +16,9 @@ import psutil
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.supervisor.core.gate import SETTLED_S
 from tests.ros.middleware.free_ports import first_port
+from tests.ros.stranger import ask
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, left_of, pair, up, verb
 
 pytestmark = pytest.mark.thorough
@@ -70,19 +67,6 @@ def told(run: Up, node: str) -> list[tuple[str, str, str]]:
 def until_ok(run: Up, since: int) -> None:
     """Read on until a verdict is ok; it may have come already, after the first `since` events."""
     run.until_verdict(lambda verdict: verdict["verdict"] == "ok", since=since)
-
-
-@pytest.fixture
-def ask(fresh_domain: int) -> Iterator[Callable[..., None]]:
-    """Give a way to ask nodes of the test's domain through their services."""
-    with GraphObserver(fresh_domain) as observer:
-        clients = NodeClients(observer)
-
-        def ask_once(doing: Callable[[NodeClients], Coroutine[Any, Any, Any]]) -> Any:
-            return asyncio.run(doing(clients))
-
-        yield ask_once
-        clients.destroy()
 
 
 def test_a_pair_is_wired_over_udp_where_nothing_was_open_before(
@@ -191,14 +175,15 @@ def test_a_node_that_nobody_declared_is_negotiated_with_wired_and_never_driven(
             guest.stdout.close()
 
 
-def test_a_lost_connection_is_told_and_made_again(
-    tmp_path: Path, fresh_domain: int, ask: Callable[..., Any]
-) -> None:
+def test_a_lost_connection_is_told_and_made_again(tmp_path: Path, fresh_domain: int) -> None:
     edit = {**AUTHORITY, "discovery/transport": "udpv4"}
     with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("system", reached="active")
         began = time.monotonic()
-        ask(lambda clients: clients.wire("/talker", "disconnect", "net", timeout_s=BOUND_S))
+        ask(
+            fresh_domain,
+            lambda each: each.wire("/talker", "disconnect", "net", timeout_s=BOUND_S),
+        )
         run.until("lost", node="/talker", connection="net", endpoint="")
         since = len(run.events)
         run.until("wiring", node="/talker", operation="map_to", connection="net")
