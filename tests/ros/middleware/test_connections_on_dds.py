@@ -44,7 +44,6 @@ UNIQUE = range(7000, 7400)
 """rmw asks for a port of its own for the reader of the graph, and gets one of these."""
 
 MakeNode = Callable[..., Node]
-SpinUntil = Callable[..., None]
 WaitUntil = Callable[..., None]
 
 

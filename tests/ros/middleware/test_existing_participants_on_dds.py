@@ -1,4 +1,7 @@
-"""An observer discovers existing participants in time, also where none can be probed."""
+"""An observer discovers existing participants in time, also where none can be probed.
+
+And it has the transports that somebody chose.
+"""
 
 from __future__ import annotations
 
@@ -190,3 +193,41 @@ def test_with_a_discovery_server_that_a_profile_names(
         use_profile(_CLIENT.format(port=port), tmp_path, monkeypatch)
         with an_existing_node(fresh_domain):
             assert seen(fresh_domain) == [True] * _OBSERVERS
+
+
+_HAS_SHARED_MEMORY = """
+import sys
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.process.shared_memory import own_segments
+
+with GraphObserver(int(sys.argv[1])):
+    print(bool(own_segments()))
+"""
+
+
+@pytest.mark.parametrize(
+    ("range_", "transports", "profile", "expected"),
+    [
+        ("SUBNET", "", "", "False"),
+        ("LOCALHOST", "", "", "False"),
+        ("SUBNET", "DEFAULT", "", "True"),
+        ("SUBNET", "", "shared memory", "True"),
+    ],
+)
+def test_an_observer_has_shared_memory_only_if_the_environment_or_a_profile_chose_it(
+    fresh_domain: int,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    range_: str,
+    transports: str,
+    profile: str,
+    expected: str,
+) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", range_)
+    monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
+    if transports:
+        monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", transports)
+    if profile:
+        use_profile(_PROFILES[profile], tmp_path, monkeypatch)
+    command = [sys.executable, "-c", _HAS_SHARED_MEMORY, str(fresh_domain)]
+    assert subprocess.check_output(command, text=True, timeout=_LIMIT_S).split()[-1] == expected

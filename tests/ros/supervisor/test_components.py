@@ -95,6 +95,11 @@ def test_components_in_a_container_of_others_come_and_go(
         assert loaded == {"loaded /robot/talker\n", f"loaded /hearer {told}\n"}
         judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
         assert judged.returncode == ExitCode.OK, judged.stdout
+        refused = verb("restart", str(manifest), "pool", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            "cannot restart '/pool': it is attached, no process of this supervisor\n"
+        )
         again = verb("restart", str(manifest), "talker", runtime=tmp_path)
         assert again.returncode == ExitCode.OK, again.stderr
         assert [pool.stdout.readline() for _ in range(2)] == [

@@ -1,4 +1,4 @@
-"""`lifecycle restart` where participants are connected by TCP, and a discovery server that dies."""
+"""Restarts and deaths where participants are connected by TCP, and a discovery server that dies."""
 
 from __future__ import annotations
 
@@ -31,45 +31,37 @@ def violations(run: Up) -> set[tuple[str, str, str]]:
     }
 
 
-def restarts(run: Up, runtime: Path, *node: str) -> None:
-    """Restart the system, or one node of it, and see it active again."""
-    done = verb("restart", "pair", *node, runtime=runtime)
-    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
-    run.until("system", reached="active")
-
-
-def ends_with_nothing_left(run: Up, runtime: Path) -> None:
-    assert verb("down", "pair", runtime=runtime).returncode == ExitCode.OK
-    assert run.finish() == ExitCode.OK
-    run.assert_nothing_left()
-
-
-def test_each_end_of_a_tcp_connection_is_found_again_after_its_restart(
-    tmp_path: Path, fresh_domain: int
+@pytest.mark.parametrize(
+    ("mode", "orders"),
+    [("static", (("talker",), ("listener",))), ("server", (("listener",), ()))],
+    ids=["static", "server"],
+)
+def test_who_is_restarted_or_killed_is_found_again(
+    tmp_path: Path, fresh_domain: int, mode: str, orders: tuple[tuple[str, ...], ...]
 ) -> None:
-    manifest = by_tcp(tmp_path, fresh_domain, mode="static", transport="tcpv4")
+    discovery = {"mode": mode} | ({"transport": "tcpv4"} if mode == "static" else {})
+    manifest = by_tcp(tmp_path, fresh_domain, **discovery)
+    numbered = manifest.read_text().replace("systems:Talker", "systems:Numbered")
+    manifest.write_text(f"{numbered}restart: always\n")
     with up(manifest, runtime=tmp_path) as run:
         run.until("system", reached="active")
-        restarts(run, tmp_path, "talker")
-        begun = len(run.events)
-        restarts(run, tmp_path, "listener")
-        run.met("log", since=begun, line="heard hello")
+        for process in ("talker", "listener"):
+            begun = len(run.events)
+            os.kill(run.pid_of(process), signal.SIGKILL)
+            run.until("restarted", process=process)
+            run.met("log", since=begun, line=f"heard pid {run.pid_of('talker')}")
+        for nodes in orders:
+            begun = run.catch_up()
+            done = verb("restart", "pair", *nodes, runtime=tmp_path)
+            assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+            run.met("system", since=begun, reached="active")
+            run.met("log", since=begun, line=f"heard pid {run.pid_of('talker')}")
         # Whoever looks on is told where they listen now.
         judged = verb("verify", str(manifest), "--timeout", "20", runtime=tmp_path)
         assert judged.returncode == ExitCode.OK, judged.stdout
-        ends_with_nothing_left(run, tmp_path)
-
-
-def test_clients_of_a_discovery_server_are_found_again_after_their_restart(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    with up(by_tcp(tmp_path, fresh_domain, mode="server"), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        begun = len(run.events)
-        restarts(run, tmp_path, "listener")
-        run.met("log", since=begun, line="heard hello")
-        restarts(run, tmp_path)
-        ends_with_nothing_left(run, tmp_path)
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.OK
+        run.assert_nothing_left()
 
 
 def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_runs(

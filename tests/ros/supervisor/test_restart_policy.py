@@ -15,7 +15,6 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import pair, up, verb
-from tests.ros.supervisor.test_restart_over_tcp import by_tcp
 
 _THIRD = {
     "run": {"python": "tests.ros.supervisor.systems:Listener"},
@@ -97,25 +96,4 @@ def test_a_node_that_fails_each_time_is_given_up_with_exit_code_7_and_its_histor
         assert (finding["rule"], finding["subject"]) == ("run.gave-up", "/talker")
         assert finding["message"].count("exit status 9") == 2
         assert len(run.of_kind("gave_up")) == 1
-        run.assert_nothing_left()
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("mode", ["static", "server"])
-def test_a_killed_node_is_found_again_over_tcp(
-    tmp_path: Path, fresh_domain: int, mode: str
-) -> None:
-    discovery = {"mode": mode} | ({"transport": "tcpv4"} if mode == "static" else {})
-    manifest = by_tcp(tmp_path, fresh_domain, **discovery)
-    numbered = manifest.read_text().replace("systems:Talker", "systems:Numbered")
-    manifest.write_text(f"{numbered}restart: always\n")
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        for process in ("talker", "listener"):
-            begun = len(run.events)
-            os.kill(run.pid_of(process), signal.SIGKILL)
-            run.until("restarted", process=process)
-            run.met("log", since=begun, line=f"heard pid {run.pid_of('talker')}")
-        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
-        assert run.finish() == ExitCode.OK
         run.assert_nothing_left()

@@ -181,10 +181,17 @@ def test_an_interrupt_takes_the_system_down_in_reverse_order(
         run.assert_nothing_left()
 
 
-def test_a_signal_during_bring_up_rolls_back(tmp_path: Path, fresh_domain: int) -> None:
+def test_a_bring_up_takes_no_orders_and_is_rolled_back_by_a_signal(
+    tmp_path: Path, fresh_domain: int
+) -> None:
     manifest = pair(tmp_path, fresh_domain, misbehave="configure:hang")
     with up(manifest, runtime=tmp_path) as run:
         run.until("log", line="about to hang in configure")
+        refused = verb("pause", "pair", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert refused.stderr == (
+            "cannot pause 'pair': it is connecting; only an active system can be paused\n"
+        )
         run.note_segments()
         run.signal(signal.SIGINT)
         assert run.finish() == ExitCode.INTERRUPTED
