@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from hearing import Hearing
 from lifecycle_driver import Driver
 from msgspec.structs import replace
 from planning import built_with, client, planned, publisher, server, subscription
@@ -17,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from lifecycle import LifecycleNode, codec, on_message, on_service
+from lifecycle import LifecycleNode, codec, on_service
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
@@ -39,18 +40,6 @@ RELIABLE = QoSProfile(depth=1000)
 
 class Talking(LifecycleNode):
     """Publishes."""
-
-
-class Hearing(LifecycleNode):
-    """Receives on `in` and on whatever it is called."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.heard: list[str] = []
-
-    @on_message("in")
-    def receive(self, message: String) -> None:
-        self.heard.append(message.data)
 
 
 class Everything(Hearing):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hearing import Hearing
 from lifecycle_driver import Driver
 from msgspec.structs import replace
 from planning import publisher, server, subscription
@@ -26,16 +27,6 @@ FLOW = PlannedParticipant(name="_it_flow_0", dscp=46, reason="unique publisher v
 
 class It(LifecycleNode):
     """Receives on `in`, if that is declared."""
-
-
-class Hearing(LifecycleNode):
-    def __init__(self) -> None:
-        super().__init__()
-        self.heard: list[str] = []
-
-    @on_message("in")
-    def receive(self, message: String) -> None:
-        self.heard.append(message.data)
 
 
 def configuration(driver: Driver) -> NodeConfiguration:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
+from hearing import Hearing
 from lifecycle_driver import Driver
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -329,8 +330,7 @@ def test_a_latched_sample_that_came_before_activation_is_received_at_activation(
     driver: Driver, build: Build
 ) -> None:
     latched = QosProfile(depth=1, durability=Durability.TRANSIENT_LOCAL)
-    node = build(Latching, planned("it", subscription("in", qos=latched)))
-    node.heard = []
+    node = build(Hearing, planned("it", subscription("in", qos=latched)))
     driver.node.create_publisher(String, "/in", to_rclpy(latched)).publish(String(data="map"))
     up(driver, "configure", "connect", node="/it")
     driver.spin_until(lambda: driver.node.count_subscribers("/in") == 1)
@@ -338,14 +338,6 @@ def test_a_latched_sample_that_came_before_activation_is_received_at_activation(
     assert node.heard == []
     up(driver, "activate", node="/it")
     driver.spin_until(lambda: node.heard == ["map"])
-
-
-class Latching(LifecycleNode):
-    heard: list[str]
-
-    @on_message("in")
-    def receive(self, message: String) -> None:
-        self.heard.append(message.data)
 
 
 def test_a_request_while_a_transition_runs_is_refused_and_the_state_can_be_read(

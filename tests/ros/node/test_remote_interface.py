@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from hearing import Hearing
 from host_process import HostProcess, hosted
 from lifecycle_driver import Driver
 from planning import built_with, planned, publisher, subscription
@@ -14,7 +15,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from std_msgs.msg import String
 
-from lifecycle import LifecycleNode, codec, on_message
+from lifecycle import codec
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import NodeConfiguration
@@ -23,20 +24,11 @@ from tests.ros.stranger import stranger
 UDP = "udpv4://127.0.0.1"
 
 
-class It(LifecycleNode):
-    heard: list[str]
-
-    @on_message("in")
-    def receive(self, message: String) -> None:
-        self.heard.append(message.data)
-
-
 @pytest.fixture
-def node(driver: Driver, context: rclpy.Context) -> LifecycleNode:
+def node(driver: Driver, context: rclpy.Context) -> Hearing:
     """A node that hears and speaks, active and spun."""
     with built_with(planned("it", subscription("in"), publisher("out")), context):
-        it = It()
-    it.heard = []
+        it = Hearing()
     driver.add(it)
     for label in ("configure", "connect", "activate"):
         assert driver.set("/it", label)
@@ -63,7 +55,7 @@ def ask(
 
 
 def test_a_plain_client_connects_maps_renames_and_disconnects(
-    driver: Driver, node: LifecycleNode
+    driver: Driver, node: Hearing
 ) -> None:
     done = [(True, "")]
     assert ask(driver, "connect_to", ("net", text(UDP)), ("mem", texts("shm://"))) == done * 2
@@ -90,7 +82,7 @@ def test_a_plain_client_connects_maps_renames_and_disconnects(
 
 
 def test_the_answer_to_map_to_comes_when_the_handover_is_over(
-    driver: Driver, node: LifecycleNode
+    driver: Driver, node: Hearing
 ) -> None:
     sender = driver.node.create_publisher(String, "/in", 10)
     driver.spin_until(lambda: sender.get_subscription_count() == 1)
@@ -148,7 +140,7 @@ def test_the_answer_to_map_to_comes_when_the_handover_is_over(
 )
 def test_a_refused_request_says_why_and_the_node_lives(
     driver: Driver,
-    node: LifecycleNode,
+    node: Hearing,
     service: str,
     name: str,
     value: ParameterValue,
@@ -160,7 +152,7 @@ def test_a_refused_request_says_why_and_the_node_lives(
 
 
 def test_one_wrong_request_of_several_does_not_spoil_the_others(
-    driver: Driver, node: LifecycleNode
+    driver: Driver, node: Hearing
 ) -> None:
     answers = ask(driver, "connect_to", ("no name", text(UDP)), ("net", text(UDP)))
     assert [ok for ok, _ in answers] == [False, True]
