@@ -318,12 +318,11 @@ def _numbers(plan: Plan, verdict: Verdict) -> tuple[FlowMeasurement, ...]:
     """Return what is measured: a supervisor knows how far the clocks of hosts are apart, too."""
     from lifecycle.supervisor.control.client import status
 
-    path = _measuring(plan)
-    if path is None:
-        return verdict.measured
-    with contextlib.suppress(UsageError, TimeoutError):  # it ends, or is busy
-        return status(path).measured
-    return verdict.measured
+    found = {each.pair: each for each in verdict.measured}
+    if (path := _measuring(plan)) is not None:
+        with contextlib.suppress(UsageError, TimeoutError):  # it ends, or is busy
+            found |= {each.pair: each for each in status(path).measured}
+    return tuple(found.values())
 
 
 def _watch(plan: Plan, format_: str) -> int:

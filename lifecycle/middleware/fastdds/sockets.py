@@ -29,6 +29,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.dscp import tos
 from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium, udp_to
 from lifecycle.network.nfe import NetworkFlowEndpoint, canonical, is_wildcard
 from lifecycle.network.ports import DG, participant_ports
@@ -39,10 +40,12 @@ _KINDS = {
     for each in CONNECTABLE
     if each.is_network and not each.is_group
 }
-_DSCP_OPTION = {
+DSCP_OPTION = {
     socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS),
     socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS),
 }
+"""What a socket of each family sends with; arrives as a control message of the same kind."""
+
 _DISCOVERY_BYTES = 1 << 22
 
 _RELEASED_S = 0.5
@@ -202,13 +205,22 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
         MiddlewareError: no socket found, or the kernel kept another value.
     """
     for each in own_sockets(nfes):
-        option = _DSCP_OPTION[each.family]
-        try:
-            each.setsockopt(*option, dscp << 2)
-        except OSError as error:
-            raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
-        if (kept := each.getsockopt(*option) >> 2) != dscp:
-            raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
+        mark(each, dscp)
+
+
+def mark(made: socket.socket, dscp: int) -> None:
+    """Have a socket send with a DSCP, 0–63.
+
+    Raises:
+        MiddlewareError: the kernel does not allow it.
+    """
+    option = DSCP_OPTION[made.family]
+    try:
+        made.setsockopt(*option, tos(dscp))
+    except OSError as error:
+        raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
+    if (kept := made.getsockopt(*option) >> 2) != dscp:
+        raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
@@ -217,7 +229,7 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     Raises:
         MiddlewareError: no socket found.
     """
-    return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
+    return {each.getsockopt(*DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
 def widen_discovery_buffers(domain_id: int) -> int:
@@ -238,7 +250,7 @@ def widen_discovery_buffers(domain_id: int) -> int:
     ports = range(first, first + DG, 2)
     count = 0
     for each in sockets_here():
-        if each.type != socket.SOCK_DGRAM or each.family not in _DSCP_OPTION:
+        if each.type != socket.SOCK_DGRAM or each.family not in DSCP_OPTION:
             continue
         before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:

@@ -12,12 +12,14 @@ import asyncio
 import contextlib
 import errno
 import socket
-import struct
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import sys
+from collections.abc import Collection, Iterable, Mapping
 
 import msgspec
 
 from lifecycle.codec import DscpValue, from_json, to_json
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.sockets import DSCP_OPTION, mark
 from lifecycle.network.medium import UDP_UNICAST
 from lifecycle.network.nfe import is_multicast
 from lifecycle.plan.model import Plan
@@ -30,13 +32,9 @@ OVERDUE_S = 6.0
 Ports = tuple[int, int]
 """Where a supervisor receives marks, over IPv4 and IPv6; 0 where it does not."""
 
-_ECN_BITS = 2
 _LONGEST = 256
 _READ_AT_ONCE = 64
-_FAMILIES = {
-    socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS, socket.IP_RECVTOS),
-    socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS, socket.IPV6_RECVTCLASS),
-}
+_RECEIVES = {socket.AF_INET: socket.IP_RECVTOS, socket.AF_INET6: socket.IPV6_RECVTCLASS}
 
 
 class _Mark(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,17 +99,18 @@ class Marks:
     @property
     def own_ports(self) -> Ports:
         """Where we receive."""
-        four, six = (self._sockets.get(each) for each in _FAMILIES)
+        four, six = (self._sockets.get(each) for each in _RECEIVES)
         return (four.getsockname()[1] if four else 0, six.getsockname()[1] if six else 0)
 
     def open(self) -> None:
         """Receive from now on; again is harmless. A host may lack an IP version."""
-        for family, (level, _, receives) in _FAMILIES.items():
+        for family, receives in _RECEIVES.items():
             if family in self._sockets:
                 continue
             with contextlib.suppress(OSError):
                 made = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
                 self._sockets[family] = made
+                level, _ = DSCP_OPTION[family]
                 if family == socket.AF_INET6:
                     made.setsockopt(level, socket.IPV6_V6ONLY, 1)
                 made.setsockopt(level, receives, 1)
@@ -150,7 +149,7 @@ class Marks:
         self._to = to
         now_s = self._loop.time()
         self._from = {each: self._from.get(each, now_s) for each in due}
-        self._arrived = {each: mark for each, mark in self._arrived.items() if each in due}
+        self._arrived = {each: last for each, last in self._arrived.items() if each in due}
 
     def send(self) -> None:
         """Send one datagram each way; what cannot be sent does not arrive, which the other sees."""
@@ -159,25 +158,24 @@ class Marks:
             port = self.ports.get(way.machine, (0, 0))[family == socket.AF_INET6]
             made = self._sockets.get(family)
             if made is not None and port:
-                level, option, _ = _FAMILIES[family]
-                mark = _Mark(run=self._run, dscp=way.dscp, to=way.address)
-                with contextlib.suppress(OSError):
-                    made.setsockopt(level, option, way.dscp << _ECN_BITS)
-                    made.sendto(to_json(mark), (way.address, port))
+                said = _Mark(run=self._run, dscp=way.dscp, to=way.address)
+                with contextlib.suppress(OSError, MiddlewareError):
+                    mark(made, way.dscp)
+                    made.sendto(to_json(said), (way.address, port))
 
     def arrived(self) -> tuple[ArrivedMark, ...]:
         """Return with what mark those arrive that must: what does not keep it, if several do."""
         found: dict[tuple[str, int], int | None] = {}
         for way, since_s in self._from.items():
             key = (way.machine, way.dscp)
-            mark, last_s = self._arrived.get(way, (None, since_s))
+            dscp, last_s = self._arrived.get(way, (None, since_s))
             if self._loop.time() > last_s + OVERDUE_S:
                 found.setdefault(key, None)
-            elif mark is not None and found.get(key) in (None, way.dscp):
-                found[key] = mark
+            elif dscp is not None and found.get(key) in (None, way.dscp):
+                found[key] = dscp
         return tuple(
-            ArrivedMark(machine=machine, dscp=dscp, arrives_as=mark)
-            for (machine, dscp), mark in sorted(found.items())
+            ArrivedMark(machine=machine, dscp=dscp, arrives_as=arrives_as)
+            for (machine, dscp), arrives_as in sorted(found.items())
         )
 
     def _read(self, made: socket.socket) -> None:
@@ -191,18 +189,12 @@ class Marks:
             with contextlib.suppress(ValueError):  # anybody may send here
                 self._take(from_json(data, _Mark, longest=_LONGEST), controls)
 
-    def _take(self, mark: _Mark, controls: Iterable[tuple[int, int, bytes]]) -> None:
-        for value in _classes(controls):
-            for machine in self.machines.get(mark.run, ()):
-                way = _Way(machine, mark.dscp, mark.to)
+    def _take(self, said: _Mark, controls: Iterable[tuple[int, int, bytes]]) -> None:
+        for level, kind, data in controls:
+            if (level, kind) not in DSCP_OPTION.values():
+                continue
+            dscp = int.from_bytes(data, sys.byteorder) >> 2  # IPv4: one byte, IPv6: an int
+            for machine in self.machines.get(said.run, ()):
+                way = _Way(machine, said.dscp, said.to)
                 if way in self._from:
-                    self._arrived[way] = (value >> _ECN_BITS, self._loop.time())
-
-
-def _classes(controls: Iterable[tuple[int, int, bytes]]) -> Iterator[int]:
-    """Yield the TOS byte, or traffic class, that came with a datagram."""
-    for level, kind, data in controls:
-        if (level, kind) == (socket.IPPROTO_IP, socket.IP_TOS):
-            yield data[0]
-        elif (level, kind) == (socket.IPPROTO_IPV6, socket.IPV6_TCLASS):
-            yield struct.unpack("=i", data[:4])[0]
+                    self._arrived[way] = (dscp, self._loop.time())

@@ -320,6 +320,8 @@ class Peers:
 
     def follow(self, flows: Iterable[FlowReport]) -> None:
         """Take the flows as they were verified just now."""
+        if self._marks.own_ports == (0, 0):
+            return  # none with a DSCP comes from elsewhere, or goes there
         machines = {each.full_name: each.machine for each in self._system.first.nodes}
         self._marks.follow(flows, machines, self._own)
 

@@ -333,7 +333,7 @@ class System:
         operation: Operation,
         apart: Callable[[ManagedProcess], tuple[str, ...]] = lambda _: (),
     ) -> None:
-        """Have our hosts do something with all of their process; nobody waits for it.
+        """Have our hosts do something with all of their process; nothing waits for it.
 
         Args:
             operation: of a whole process.
