@@ -511,6 +511,9 @@ class Consequence(enum.Enum):
     STOP = "stop"  # the run ends
 
 
+SIM_TIME = "use_sim_time"
+"""The parameter with which a node takes its time from /clock."""
+
 BY_DEFAULT = "default"
 """Key of `on_violation` for every rule that it does not name."""
 

@@ -19,6 +19,7 @@ from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
+    SIM_TIME,
     SUPERVISION_KEYS,
     Manifest,
     Node,
@@ -28,8 +29,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.yaml.document import Cursor, error, warning
-
-SIM_TIME = "use_sim_time"
 
 
 class Shared(msgspec.Struct, frozen=True, kw_only=True):

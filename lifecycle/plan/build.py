@@ -23,6 +23,7 @@ from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
+    SIM_TIME,
     Discovery,
     DiscoveryMode,
     DiscoveryRange,
@@ -42,7 +43,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import name_in_graph
 from lifecycle.manifest.parameter_files import ParameterFiles
-from lifecycle.manifest.shared import SIM_TIME
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW

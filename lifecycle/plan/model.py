@@ -17,6 +17,7 @@ from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
+    SIM_TIME,
     Authority,
     DiscoveryRange,
     Endpoint,
@@ -32,7 +33,6 @@ from lifecycle.manifest.model import (
     TargetState,
     UniqueHow,
 )
-from lifecycle.manifest.shared import SIM_TIME
 from lifecycle.network.medium import UDP_UNICAST, Medium
 from lifecycle.network.nfe import UniqueRequirement
 

@@ -17,7 +17,7 @@ from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.node.host.control import HostChannel, HostSpec, give_up
+from lifecycle.node.host.control import Command, HostChannel, HostSpec, give_up
 
 _PRELOADED = (
     "rclpy.executors",
@@ -64,6 +64,8 @@ def preload(types: Iterable[str] = ()) -> None:
         importlib.import_module(name)
     for interface in _INTERFACES:
         load_type_support(interface)
+    for message in (HostSpec, Command):
+        codec.decoder(message)
     unknown_versions()  # it loads the libraries of the RMW, which hosts then share
     for interface in types:
         with contextlib.suppress(Exception):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.shared import SIM_TIME
+from lifecycle.manifest.model import SIM_TIME, EndpointKind
 from lifecycle.plan.model import PlannedNode, uses_sim_time
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
