@@ -99,8 +99,8 @@ class Requests:
             number, noted_s = self._noted.get(key, (0, ()))
             noted_s = noted_s if number == request.number else ()
             waits_s = (now - then for now, then in zip(node.run_delays_s(), noted_s, strict=False))
-            # Those that wait at once have waited no longer for it.
-            delay_s = max(0.0, min(max(waits_s, default=0.0), at_s - request.since_s))
+            # One waits for the other, too; both at once no longer than there is time.
+            delay_s = max(0.0, min(sum(waits_s), at_s - request.since_s))
             left_s = late_at_s(replace(request, waited_s=delay_s)) - at_s
             if left_s >= _slice_s(request):
                 waited_s[key] = delay_s
