@@ -2,8 +2,8 @@
 
 Owns: how much each bound needs to be judged: a delay 200 messages or 5 s, a loss 10 / bound
 messages, a rate 2 s and 20 periods. Until then nothing is said of it, as a canary analysis says
-nothing before its first interval is over. Of fewer messages than 200 more must be late than chance
-explains, or they decide nothing.
+nothing before its first interval is over. Where few messages decide, more of them must be late or
+lost than chance explains.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         is_late = delay_ms - unsure_ms > bound.most
         if is_late and delays.messages < DELAY_MESSAGES:
             late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
-            is_enough = is_enough and late >= too_many_late(delays.messages, 1 - bound.quantile)
+            is_enough = is_enough and late >= too_many(delays.messages, 1 - bound.quantile)
         if is_enough and is_late:
             kept = False
         elif is_enough and delay_ms + unsure_ms <= bound.most:
@@ -149,14 +149,14 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
     )
 
 
-def too_many_late(messages: int, share: float) -> int:
-    """Return how many late messages are no chance any more, where a share of all may be late.
+def too_many(messages: int, share: float) -> int:
+    """Return how many late or lost messages are no chance any more, where a share of all may be.
 
-    Were each message late with that probability, so many would be in 1 % of samples at most. The
-    normal approximation of the binomial distribution, and 2 more because that is skewed.
+    Were each one with that probability, so many would be in 1 % of samples at most. The normal
+    approximation of the binomial distribution, and 2 more because that is skewed.
 
     Args:
-        messages: > 0, of the sample; that all are late is never chance.
+        messages: > 0, of the sample; that all are is never chance.
         share: > 0 and < 1.
     """
     expected = messages * share
@@ -195,12 +195,11 @@ def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
 def _loss(bound: Bound, sample: Sample) -> Judgement:
     assert bound.most is not None
     needed = LOSS_EVENTS / bound.most
-    seen = sample.last(published=needed)
-    kept: bool | None = None
-    if seen.lost > bound.most * max(seen.published, needed):
-        kept = False  # whatever else arrives
-    elif seen.published >= needed:
-        kept = True
+    seen, kept = sample.last(published=needed), _loses_less(bound.most, needed, sample)
+    # More were lost than allowed, but no more than by chance: a longer past decides.
+    while kept is None and seen.published >= needed:
+        needed *= 2
+        seen, kept = sample.last(published=needed), _loses_less(bound.most, needed, sample)
     left = needed - seen.published
     return Judgement(
         kept=kept,
@@ -209,6 +208,14 @@ def _loss(bound: Bound, sample: Sample) -> Judgement:
         share=seen.lost / seen.published / bound.most if seen.published else None,
         decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
     )
+
+
+def _loses_less(share: float, needed: float, sample: Sample) -> bool | None:
+    """Return whether no more than a share was lost of so many messages; None if it is open."""
+    seen = sample.last(published=needed)
+    if seen.lost >= too_many(math.ceil(max(seen.published, needed)), share):
+        return False  # whatever else arrives
+    return True if seen.published >= needed and seen.lost <= share * seen.published else None
 
 
 def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, ms, percentile, too_many_late
+from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, ms, percentile, too_many
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, buckets_of, least_ns
 from lifecycle.measure.sample import DELAY_S, SLOT_S, Measured, Sample, Slot
@@ -186,7 +187,7 @@ def test_a_delay_is_judged_by_its_quantile_and_heals() -> None:
 
 @pytest.mark.parametrize(
     ("late", "kept"),
-    [(1, True), (2, None), (too_many_late(75, 0.01) - 1, None), (too_many_late(75, 0.01), False)],
+    [(1, True), (2, None), (too_many(75, 0.01) - 1, None), (too_many(75, 0.01), False)],
 )
 def test_a_few_late_messages_of_not_many_decide_nothing(late: int, kept: bool | None) -> None:
     delays = ((at_s, number, 9 < number < 10 + late) for at_s, _, number in steady(15, 5))
@@ -199,7 +200,7 @@ def test_a_few_late_messages_of_not_many_decide_nothing(late: int, kept: bool | 
 def test_too_many_late_messages_are_in_about_1_percent_of_samples(
     messages: int, share: float
 ) -> None:
-    number = too_many_late(messages, share)
+    number = too_many(messages, share)
     logs = (
         math.lgamma(messages + 1)
         - math.lgamma(each + 1)
@@ -211,7 +212,7 @@ def test_too_many_late_messages_are_in_about_1_percent_of_samples(
     chance = sum(map(math.exp, logs))
     assert chance < 0.0125 or number == messages
     assert number > messages * share
-    assert [too_many_late(*each) for each in ((1, 0.1), (200, 0.01), (100, 0.5))] == [1, 7, 63]
+    assert [too_many(*each) for each in ((1, 0.1), (200, 0.01), (100, 0.5))] == [1, 7, 63]
 
 
 def test_reception_is_judged_for_the_network() -> None:
@@ -271,13 +272,38 @@ def test_a_loss_is_judged_after_ten_losses_or_as_many_messages_as_would_have_the
 
 
 @given(st.integers(0, 60))
-def test_a_loss_is_compared_with_the_exact_share(number: int) -> None:
+def test_a_loss_is_violated_where_chance_does_not_explain_it(number: int) -> None:
     dropped = frozenset(range(20, 20 + 15 * number, 15))
     sample = counted(steady(100, 10, lost=dropped), until_s=10)
     found = judge(LOSS, sample)
-    assert (found.kept, found.share) == (number <= 10, pytest.approx(number / 10))
-    sign = "≤" if found.kept else ">"
+    kept = True if number <= 10 else (None if number < too_many(1000, 0.01) else False)
+    assert (found.kept, found.share) == (kept, pytest.approx(number / 10))
+    sign = ">" if kept is False else "≤"
     assert (found.observed, found.allowed) == (f"{number} of 1000 lost", f"{sign} 0.01")
+    assert (found.decides_in_s is None) == (kept is not None)
+
+
+@pytest.mark.parametrize(("of_1000", "kept"), [(11, None), (14, False), (9, True)])
+def test_a_longer_past_decides_what_chance_may_explain(of_1000: int, kept: bool | None) -> None:
+    recent = tuple(Slot(seconds=1, messages=987, lost=13) for _ in range(1))
+    older = tuple(Slot(seconds=1, messages=1000 - of_1000, lost=of_1000) for _ in range(31))
+    found = judge(LOSS, Sample(seconds=32, slots=recent + older))
+    assert found.kept is kept
+
+
+def test_half_of_the_loss_that_is_allowed_raises_no_alarm_and_twice_of_it_is_found() -> None:
+    chance = random.Random(36)
+
+    def slots(share: float) -> tuple[Slot, ...]:
+        lost = [sum(chance.random() < share for _ in range(50)) for _ in range(100)]
+        return tuple(Slot(seconds=1, messages=50 - each, lost=each) for each in lost)
+
+    def share_of(kept: bool | None, share: float) -> float:
+        found = [judge(LOSS, Sample(seconds=100, slots=slots(share))).kept for _ in range(500)]
+        return found.count(kept) / len(found)
+
+    assert share_of(False, 0.005) == 0
+    assert share_of(False, 0.02) > 0.9
 
 
 @pytest.mark.parametrize(
