@@ -59,7 +59,7 @@ def own_segments() -> frozenset[str]:
 
     A participant of it that has the transport has one from when it is made until it ends.
     """
-    groups = {to: _group(Path(to).name) for _, to in open_files()}
+    groups = {to: _group(to.rpartition("/")[2]) for _, to in open_files()}
     return frozenset(to for to, group in groups.items() if group and "_port" not in group)
 
 
