@@ -14,7 +14,7 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import RunKind
 from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
 from lifecycle.supervisor.core import gate
-from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
+from lifecycle.supervisor.core.advance import holds_up, late_at_s, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import is_restarted
@@ -60,6 +60,7 @@ _ING = {
 
 
 APPEARING = "waiting to appear in the graph"
+_UNMANAGED = "waiting for its lifecycle services"
 
 
 def doing(run: Run, node: Node) -> str:
@@ -67,7 +68,8 @@ def doing(run: Run, node: Node) -> str:
     if node.request is not None:
         hosted = node.planned.run.kind is RunKind.PYTHON or node.planned.run.component
         if node.request.step is Step.START and not hosted:
-            return APPEARING
+            services = _UNMANAGED if node.planned.managed else "waiting for its parameter services"
+            return services if node.appeared else APPEARING
         return _ING.get(node.request.step, "being taken down")
     process = run.processes.get(node.process)
     if process is not None and process.state is ProcessState.STARTING:
@@ -158,12 +160,31 @@ def too_late(run: Run, node: Node, limit_s: float, where: str = "") -> Failure:
     what = doing(run, node)
     at = f", in {where}" if where else ""
     text = f"cannot bring up {node.name!r}: it was still {what} after {limit_s:g} s{at}"
-    text += _unnamed(run, node)
+    text += _advice(run, node)
     return _failure(DEADLINE, node.name, text, run.process_of(node))
 
 
-def _unnamed(run: Run, node: Node) -> str:
-    """Say how a node is named that a command may call otherwise; empty where that is not it."""
+def say_slow(run: Run) -> list[Event]:
+    """Say once of a node that is to be found in the graph what is waited for, and how long yet."""
+    said: list[Event] = []
+    for node in run.nodes.values():
+        request = node.request
+        if request is None or request.said or request.step is not Step.START:
+            continue
+        what = doing(run, node)
+        if what in (APPEARING, _UNMANAGED) and run.is_past(request.since_s + gate.SAY_S):
+            request.said = True
+            left_s = late_at_s(request) - run.now_s
+            limit = f", for up to {left_s:.0f} s more" if left_s < NEVER_S else ""
+            text = f"{node.name!r} is still {what}{limit}"
+            said.append(Notice(message=text + _advice(run, node)))
+    return said
+
+
+def _advice(run: Run, node: Node) -> str:
+    """Say what key of the manifest may mend that a node is not found; empty where none may."""
+    if doing(run, node) == _UNMANAGED:
+        return f"; if it is a plain node, write 'managed: false' at nodes.{node.key}"
     process, planned = run.processes.get(node.process), node.planned
     if process is None or planned.run.kind is not RunKind.COMMAND:
         return ""
@@ -468,7 +489,7 @@ def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
     culprit = busy[0] if busy else None
     subject = run.plan.system if culprit is None else culprit.name
     text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run) or why}"
-    text += next(filter(None, (_unnamed(run, each) for each in run.nodes.values())), "")
+    text += next(filter(None, (_advice(run, each) for each in run.nodes.values())), "")
     for node in busy:
         node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)

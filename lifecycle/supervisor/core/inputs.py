@@ -98,6 +98,7 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
         levels: of nodes of ours whose state others may change.
         health: whether nodes are healthy, as far as that is known.
         shown: what others wait for of nodes of ours, as far as the graph shows it.
+        appeared: nodes that are in the graph now; what drives them may yet be missing.
         elsewhere: conditions that nodes of other supervisors have reached.
         left: full names of all nodes whose supervisor was shut down; None if nothing is new.
     """
@@ -105,6 +106,7 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
     levels: Mapping[str, Level] = {}
     health: Mapping[str, bool] = {}
     shown: Mapping[str, frozenset[Readiness]] = {}
+    appeared: frozenset[str] = frozenset()
     elsewhere: Mapping[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] | None = None
 

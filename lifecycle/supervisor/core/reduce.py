@@ -76,6 +76,7 @@ def _settle(run: Run) -> list[Event]:
         events += settle_first_contact(run)
         events += orders.settle_orders(run)
         events += consequences.settle_consequences(run)
+        events += failure.say_slow(run)
         events += _hold(run)
     if passage is not None and run.passage is None and was_held:
         run.changed()  # a look that began on the way through the gate measures nothing
@@ -140,7 +141,7 @@ def _ends_in_order(run: Run, process: Process, given: inputs.Exited) -> bool:
 def _is_down(node: Node) -> None:
     node.level = node.base = Level.DOWN
     node.request = None
-    node.stuck = node.wired = node.healthy = node.let_through = False
+    node.stuck = node.wired = node.healthy = node.let_through = node.appeared = False
     node.silent, node.hangs, node.guarded = "", "", 0
     node.shown = frozenset()
 
@@ -260,6 +261,8 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
         if key in run.nodes and run.nodes[key].shown != shown:
             run.nodes[key].shown = shown
             run.changed()
+    for key in given.appeared & run.nodes.keys():
+        run.nodes[key].appeared = True
     for key, conditions in given.elsewhere.items():
         if run.elsewhere.get(key) != conditions:
             run.elsewhere = {**run.elsewhere, key: conditions}

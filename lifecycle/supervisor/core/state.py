@@ -125,6 +125,7 @@ class Request(msgspec.Struct, kw_only=True):
     Attributes:
         limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
         waited_s: of the time since, without CPU: it does not count.
+        said: it was said that it takes long.
     """
 
     number: int
@@ -133,6 +134,7 @@ class Request(msgspec.Struct, kw_only=True):
     limit_s: float
     own_s: float = 0.0
     waited_s: float = 0.0
+    said: bool = False
 
 
 _MANAGED = {
@@ -154,6 +156,7 @@ class Node(msgspec.Struct, kw_only=True):
         silent: why it cannot be reached; empty while it can.
         hangs: why its process's watchdog is to end it, if it has one; empty while it does not hang.
         shown: what others wait for of it, as far as the graph shows it.
+        appeared: it has been in the graph, of one that is not in our host.
         renew: it is to go down once, whatever it is wanted to be.
         due_s: it is not started before.
         withheld: why a consequence keeps it inactive until a person lets it through the gate.
@@ -173,6 +176,7 @@ class Node(msgspec.Struct, kw_only=True):
     silent: str = ""
     hangs: str = ""
     shown: frozenset[Readiness] = frozenset()
+    appeared: bool = False
     renew: bool = False
     due_s: float = 0.0
     withheld: str = ""

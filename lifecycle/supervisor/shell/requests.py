@@ -227,6 +227,7 @@ class Requests:
                 node.state = UNCONFIGURED
             return Level.STARTED
         await self._appears(node.name)
+        self._shell.give(inputs.Saw(appeared=frozenset({node.core.key})))
         if planned.managed or node.is_to_be_given:
             self._check_alone(node)
         if not planned.managed:

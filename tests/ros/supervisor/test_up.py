@@ -127,6 +127,24 @@ def test_what_needs_libraries_that_are_known_is_refused_before_anything_is_start
             assert re.match(rf"{re.escape(str(manifest))}:\d+:\d+: cannot ", run.said())
 
 
+def test_a_plain_node_that_is_not_declared_as_one_is_named_with_the_key_that_mends_it(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    plain = "import rclpy; rclpy.init(); rclpy.spin(rclpy.create_node('plain'))"
+    node = {"run": {"command": [sys.executable, "-c", plain]}, "timeouts": {"start_s": 4}}
+    with up(write(tmp_path, fresh_domain, {"plain": node}, "one"), runtime=tmp_path) as run:
+        said = run.until("notice")["message"]
+        assert re.fullmatch(
+            "'/plain' is still waiting for its lifecycle services, for up to [12] s more; "
+            "if it is a plain node, write 'managed: false' at nodes.plain",
+            said,
+        ), said
+        shown = verb("status", "one", runtime=tmp_path).stdout
+        assert "waiting for its lifecycle services" in shown
+        assert run.finish() == ExitCode.BRING_UP_FAILED
+        assert "write 'managed: false' at nodes.plain" in run.verdict["findings"][0]["message"]
+
+
 @pytest.mark.thorough
 def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
     tmp_path: Path, fresh_domain: int

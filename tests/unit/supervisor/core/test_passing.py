@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, Discovery, RunKind
+from lifecycle.manifest.model import Condition, Discovery, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
 from lifecycle.supervisor.core.failure import ALSO_S
@@ -72,6 +72,22 @@ def test_who_waits_is_named_with_what_it_waits_for_when_it_dies_and_when_time_is
     late = "cannot bring up 'robot' within 3 s: /camera is still configuring; /viewer waits to "
     assert play.failures == [("/camera", f"{late}configure until /camera is configured")]
     assert play.heard(Failure)[0].process == "camera"
+
+
+def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_mends_it() -> None:
+    node = planned_node("driver", kind=RunKind.COMMAND, timeouts=Timeouts(start_s=10.0))
+    play = Play(plan_of(node), ways={"driver start": "hang"})
+    play.wait(1.0)
+    assert play.heard(Notice) == []
+    play.give(inputs.Saw(appeared=frozenset({"driver"})))
+    play.wait(1.1)
+    waits = "waiting for its lifecycle services"
+    mends = "if it is a plain node, write 'managed: false' at nodes.driver"
+    said = f"'/driver' is still {waits}, for up to 8 s more; {mends}"
+    assert [each.message for each in play.heard(Notice)] == [said]
+    play.wait(8.0)
+    late = f"cannot bring up '/driver': it was still {waits} after 10 s; {mends}"
+    assert play.failures == [("/driver", late)]
 
 
 def test_all_that_fails_side_by_side_is_named_and_no_other_step_begins() -> None:
