@@ -200,11 +200,12 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             yield "executor: events gives callbacks no message info"
         if kinds & _DELAYS and not self.has_clocks:
             yield "the clocks of the two hosts are not compared"
-        one_publishers = kinds - _DELAYS
-        if quantity in self.of_topic:
-            one_publishers &= {Kind.LOSS}
-        if self.several > 1 and one_publishers:
-            yield f"nothing shows which of the {self.several} publishers of the topic sent what"
+        if self.several > 1 and kinds - _DELAYS:
+            publishers = f"{self.several} publishers of the topic"
+            if quantity not in self.of_topic:
+                yield f"nothing shows which of the {publishers} sent what"
+            elif Kind.LOSS in kinds:
+                yield f"with {publishers} nothing counts what the subscription's full queue drops"
         if Kind.LOSS in kinds and self.sample is not None and self.sample.lost is None:
             yield "its RMW gives messages no publication sequence numbers"
 

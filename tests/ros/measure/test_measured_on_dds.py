@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import UInt64
 
 from lifecycle.errors import ExitCode
 from tests.ros.supervisor.running import LIMITS, up, verb, write
@@ -197,3 +201,25 @@ def test_what_a_node_of_others_takes_is_unverifiable_and_strict_refuses_it(
         run.until("system", reached="active")
         fault.write_text("slow")
         run.until_found("flow.rate", SUBJECT)
+
+
+@pytest.mark.parametrize("reliability", ["BEST_EFFORT", "RELIABLE"])
+def test_the_message_lost_event_does_not_count_what_a_full_queue_drops(
+    make_node: Callable[..., Node], spin_until: Callable[..., None], reliability: str
+) -> None:
+    """If it did, the loss of a topic with several publishers could be measured by it."""
+    got: list[int] = []
+    lost: list[object] = []
+    node = make_node("both")
+    qos = QoSProfile(depth=5, reliability=ReliabilityPolicy[reliability])
+    publisher = node.create_publisher(UInt64, "numbers", qos)
+    events = SubscriptionEventCallbacks(message_lost=lost.append)
+    node.create_subscription(
+        UInt64, "numbers", lambda message: got.append(message.data), qos, event_callbacks=events
+    )
+    spin_until(publisher.get_subscription_count, node)
+    for number in range(20):
+        publisher.publish(UInt64(data=number))
+    end_s = time.monotonic() + 1.0
+    spin_until(lambda: time.monotonic() > end_s, node)
+    assert (got, lost) == ([15, 16, 17, 18, 19], [])
