@@ -9,6 +9,7 @@ is an error; what only running it, or another host, can show is named as unresol
 from __future__ import annotations
 
 import functools
+import importlib.util
 import os
 import re
 import shutil
@@ -19,6 +20,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
+from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.manifest.yaml.document import error, warning
@@ -38,6 +40,9 @@ UNHANDLED = "program.handler"
 UNDECLARED = "program.endpoint"
 IMMOVABLE = "program.connection"
 NO_HEALTH = "program.health"
+IMPORT = "program.import"
+UNCALLED = "program.callback"
+PARAMETER = "program.parameter"
 
 _WORDS = {
     EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
@@ -197,6 +202,7 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
     if found.kind in _OF_RCLPY:
         yield from _immovable(node, found, at, authority)
     yield from _without_health(node, found)
+    yield from _slips(node, found, at, ours=ours)
     yield from _interface(node, found, at, subject)
 
 
@@ -404,6 +410,25 @@ def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnost
                 f"{each.kind.noun} {each.name!r}",
                 _declared(each.name, declared),
             )
+
+
+def _slips(node: Node, found: NodeClass, at: Position, *, ours: bool) -> Iterator[Diagnostic]:
+    """Yield what the code of a class says that will not be there, or that nothing calls."""
+    for each in found.missing if ours and importlib.util.find_spec("rclpy") else ():
+        message = f"cannot import {each.name!r}, as {each.place} does: it is not installed here"
+        yield warning(IMPORT, at, message, "install it where the node runs")
+    for each in found.uncalled if found.kind is not ClassKind.PLAIN else ():
+        message = f"cannot tell what {each.name} ({each.place}) is for: nothing calls it"
+        yield warning(UNCALLED, at, message, f"did you mean {each.near!r}?")
+    declared = [each.name for each in node.interface.parameters]
+    known = {*declared, *(name for name, _ in node.parameters)}
+    for each in found.reads if not node.parameter_files else ():
+        if each.name not in known and not is_implicit(each.name):
+            message = (
+                f"cannot get parameter {each.name!r} in {each.place}: {node.key!r} declares none "
+                "of that name"
+            )
+            yield warning(PARAMETER, at, message, _declared(each.name, declared))
 
 
 def _declared(name: str, declared: list[str]) -> str:

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import ast
 import builtins
+import difflib
 import enum
 import importlib.machinery
 import importlib.util
+import itertools
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -44,6 +46,13 @@ _DECLARES = {
     *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
     *("declare_action", "declare_action_client"),
 }
+_CALLBACKS = tuple(
+    f"on_{each}"
+    for each in (
+        *("configure", "connect", "activate", "deactivate"),
+        *("disconnect", "cleanup", "shutdown", "error"),
+    )
+)
 _OF_HOST = {"rclpy.init", "rclpy.spin", "rclpy.shutdown", "init", "spin", "shutdown"}
 """What a script's `main` calls, and a host does itself."""
 
@@ -86,6 +95,20 @@ class Use(msgspec.Struct, frozen=True, kw_only=True):
     decides: bool = False
 
 
+class Slip(msgspec.Struct, frozen=True, kw_only=True):
+    """What its code says that nothing answers to.
+
+    Attributes:
+        name: of a parameter, a method or a module.
+        place: `file:line`.
+        near: what was meant, where that is likely.
+    """
+
+    name: str
+    place: str
+    near: str = ""
+
+
 class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
     """What the source of a class, or of a function that returns nodes, shows.
 
@@ -99,6 +122,9 @@ class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
         unknown: why more may belong to it than is known; empty if nothing does.
         declares: its code declares endpoints itself.
         has_health: it, or a base of it, has a `health` method of its own.
+        reads: parameters that it gets by a literal name, and does not declare itself.
+        uncalled: methods that are called almost as a transition callback is, and by nothing.
+        missing: packages that its module imports, and that are not installed here.
     """
 
     name: str
@@ -112,6 +138,9 @@ class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
     unknown: str = ""
     declares: bool = False
     has_health: bool = False
+    reads: tuple[Slip, ...] = ()
+    uncalled: tuple[Slip, ...] = ()
+    missing: tuple[Slip, ...] = ()
 
 
 class _Module(msgspec.Struct):
@@ -216,7 +245,31 @@ class Sources:
                 for each in ast.walk(statement)
             ),
             has_health=any("health" in _binds(statement) for _, statement in body),
+            reads=() if unknown else _reads(body),
+            uncalled=tuple(slip for each, method in methods for slip in _uncalled(each, method)),
+            missing=() if unknown else tuple(self._missing(value)),
         )
+
+    def _missing(self, of: _Definition) -> Iterator[Slip]:
+        """Yield the packages that the top of a module imports, and that are not there."""
+        for statement in dict.fromkeys(itertools.chain(*of.module.bound.values())):
+            names: list[str] = []
+            if isinstance(statement, ast.Import):
+                names = [each.name for each in statement.names]
+            elif isinstance(statement, ast.ImportFrom) and not statement.level:
+                names = [str(statement.module)]
+            for name in dict.fromkeys(each.partition(".")[0] for each in names):
+                if not self._has(name):
+                    yield Slip(name=name, place=of.place(statement))
+
+    def _has(self, package: str) -> bool:
+        try:
+            self._locate(package)
+        except UnknownError:
+            return True
+        except NotThereError as problem:
+            return not problem.message.startswith("cannot find module")
+        return True
 
     def _line(self, value: _Definition) -> tuple[list[_Definition], set[str], str]:
         """Return a class and its bases, the known ones by name, and what is open."""
@@ -493,6 +546,38 @@ def _asks(of: _Definition, function: _AnyFunction) -> Iterator[Use]:
             ) if attr in _ACCESS:
                 text = ast.unparse(node)[:80]
                 yield Use(kind=_ACCESS[attr], name=name, text=text, place=of.place(node))
+
+
+def _reads(body: Sequence[tuple[_Definition, ast.stmt]]) -> tuple[Slip, ...]:
+    """Return the parameters that code gets by name; none where it may declare others, too."""
+    gets: list[Slip] = []
+    own: set[str] = set()
+    for of, statement in body:
+        for node in ast.walk(statement):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="declare_parameter"), args=[first, *_]):
+                    if not isinstance(first, ast.Constant):
+                        return ()
+                    own.add(str(first.value))
+                case ast.Attribute(attr="declare_parameters"):
+                    return ()
+                case ast.keyword(arg=str(word)) if "_parameters" in word:
+                    return ()  # allow_undeclared_parameters and its like
+                case ast.Call(
+                    func=ast.Attribute(value=ast.Name(id="self"), attr="get_parameter"),
+                    args=[ast.Constant(value=str(name))],
+                ):
+                    gets.append(Slip(name=name, place=of.place(node)))
+    return tuple(each for each in gets if each.name not in own)
+
+
+def _uncalled(of: _Definition, function: _AnyFunction) -> Iterator[Slip]:
+    name = function.name
+    if not name.startswith("on_") or name in _CALLBACKS or function.decorator_list:
+        return
+    near = difflib.get_close_matches(name, _CALLBACKS, n=1, cutoff=0.85)
+    if near and len(re.findall(rf"\b{name}\b", of.module.text)) == 1:
+        yield Slip(name=f"{of.node.name}.{name}", place=of.place(function), near=near[0])
 
 
 def _shown(file: Path) -> str:

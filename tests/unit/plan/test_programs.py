@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.manifest.diagnostics import Severity
 from lifecycle.manifest.model import (
     Authority,
     ConnectionDeclaration,
@@ -166,6 +167,48 @@ def test_what_only_running_would_tell_is_named(folder: Path, text: str) -> None:
 def test_a_compiled_module_is_named(folder: Path) -> None:
     (folder / "fast.abi3.so").write_bytes(b"")
     assert said(python("fast:Talker")) == ["? class 'fast:Talker': fast is compiled"]
+
+
+SLIPS = """
+import nosuch.part, os
+from gone import thing
+from lifecycle import LifecycleNode
+try:
+    import optional
+except ImportError:
+    pass
+class Talker(LifecycleNode):
+    def on_configur(self, state):
+        self.declare_parameter("own", 1)
+        self.get_parameter("sped"), self.get_parameter("own"), self.get_parameter("use_sim_time")
+    def on_activated(self, other): ...
+    def on_wave(self): ...
+    def on_message(self): ...
+"""
+
+
+def test_what_code_says_and_nothing_answers_to_is_warned_of(folder: Path) -> None:
+    write(folder, talk=SLIPS, free=SLIPS.replace('"own", 1', "self.name, 1"))
+    found = python("talk:Talker")
+    assert {each.severity for each in found.diagnostics} == {Severity.WARNING}
+    missing = "it is not installed here; install it where the node runs"
+    parameter = (
+        "cannot get parameter 'sped' in talk.py:12: 'talker' declares none of that name; "
+        "declared: none"
+    )
+    callback = (
+        "cannot tell what Talker.{} (talk.py:{}) is for: nothing calls it; did you mean '{}'?"
+    )
+    assert said(found) == [
+        f"cannot import 'nosuch', as talk.py:2 does: {missing}",
+        f"cannot import 'gone', as talk.py:3 does: {missing}",
+        callback.format("on_configur", 10, "on_configure"),
+        callback.format("on_activated", 13, "on_activate"),
+        parameter,
+    ]
+    # A name that is computed may be any.
+    assert parameter.replace("talk.py", "free.py") not in said(python("free:Talker"))
+    assert [each for each in said(python("talk:Talker", ours=False)) if "import" in each] == []
 
 
 def test_handlers_and_endpoints_are_paired_as_at_run_time(folder: Path) -> None:
