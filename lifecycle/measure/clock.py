@@ -13,13 +13,17 @@ from collections.abc import Iterable
 
 import msgspec
 
-from lifecycle.measure.sample import DELAY_S
+from lifecycle.measure.sample import DELAY_S, SLOT_S
 
 _DRIFT = 10_000
 """Two clocks drift apart by one part of so many, 100 ppm, at most. RFC 5905 §7.2 allows 15 ppm for
 one clock; the quartz of one that nothing disciplines is off by up to 50 ppm."""
 
-_JUDGED_NS = round(DELAY_S * 1e9)
+JUDGED_S = DELAY_S + 3 * SLOT_S
+"""Messages that are judged are this old at most: a slot is closed and reported within two more, and
+a busy host has another one."""
+
+_JUDGED_NS = round(JUDGED_S * 1e9)
 
 
 class ClockOffset(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from collections import Counter as Counts
 from collections import deque
 from collections.abc import Iterable, Mapping
 
-from lifecycle.measure.delays import LONGEST_NS, Delays, buckets_of, signed_buckets_of
+from lifecycle.measure.delays import LONGEST_NS, Delays, buckets_of, least_ns, signed_buckets_of
 from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Sample, Slot
 
 WARM_UP_S = 0.5
@@ -30,9 +30,9 @@ _MOST_NOTED = 64
 _UNNUMBERED = 1 << 63
 """RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED is larger, no sequence number is."""
 
-_BELOW_NS = 1 << 26
-"""Where delays of another clock fall below their shift by more, about 67 ms, they are counted anew:
-their buckets would be larger than a millisecond."""
+_APART_NS = 1 << 26
+"""Delays of another clock that are further from their shift, about 67 ms, get another one: their
+buckets would be larger than a millisecond."""
 
 _NS = 1e9
 _SLOT_NS = int(SLOT_S * _NS)
@@ -63,9 +63,7 @@ class Counter:
         self._messages = 0
         self._lost: int | None = 0
         self._levels: list[deque[Slot]] = [deque() for _ in range(_LEVELS)]
-        self._delays: deque[tuple[dict[int, int], dict[int, int]]] = deque(
-            maxlen=round(DELAY_S / SLOT_S)
-        )
+        self._delays: deque[tuple[Counts[int], Counts[int]]] = deque(maxlen=round(DELAY_S / SLOT_S))
         self._open()
 
     def _open(self) -> None:
@@ -102,7 +100,7 @@ class Counter:
             )
 
     def _recent(self) -> tuple[Delays, Delays]:
-        chosen: list[tuple[dict[int, int], dict[int, int]]] = []
+        chosen: list[tuple[Counts[int], Counts[int]]] = []
         messages = 0
         for each in reversed(self._delays):
             chosen.append(each)
@@ -123,7 +121,8 @@ class Counter:
             before, last = last, info["publication_sequence_number"]
             # When it was published is not known by another clock, but when it was received.
             at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
-            if at_ns < self._published_ns or now_ns < self._since_ns:
+            # Its own clock may have been set back since.
+            if at_ns < self._published_ns <= wall_ns or now_ns < self._since_ns:
                 continue
             if now_ns >= self._slot_ns + _SLOT_NS:
                 self._add(used, received)
@@ -158,13 +157,21 @@ class Counter:
     def _shifted(self, used: list[int], received: list[int]) -> tuple[list[int], list[int]]:
         """Return by how much delays are longer than a short one."""
         least = min(used)
-        shift = least if self._shift_ns is None else self._shift_ns
-        if not (least - shift > -_BELOW_NS and max(used) - shift < LONGEST_NS):
+        shift = self._shift_ns = least if self._shift_ns is None else self._shift_ns
+        if not (least - shift > -_APART_NS and max(used) - shift < LONGEST_NS):
+            self._move_shift(least - shift)
             shift = least
-            self._used, self._received = Counts(), Counts()
-            self._delays.clear()
-        self._shift_ns = shift
         return [each - shift for each in used], [each - shift for each in received]
+
+    def _move_shift(self, by_ns: int) -> None:
+        self._shift_ns = (self._shift_ns or 0) + by_ns
+        kept = (counts for slot in self._delays for counts in slot)
+        for counts in (self._used, self._received, *kept):
+            before = tuple(counts.items())
+            counts.clear()
+            for bucket, number in before:
+                (moved,) = signed_buckets_of((least_ns(bucket) - by_ns,))
+                counts[moved] += number
 
     def _close_slots(self, now_ns: int) -> None:
         while now_ns - self._slot_ns >= _SLOT_NS:
@@ -172,6 +179,9 @@ class Counter:
             self._delays.append((self._used, self._received))
             self._keep(Slot(seconds=SLOT_S, messages=self._slot_messages, lost=self._slot_lost))
             self._open()
+            lately = [min(used) for used, _ in self._delays if used][-2:]
+            if self.is_apart and len(lately) > 1 and least_ns(min(lately)) > _APART_NS:
+                self._move_shift(least_ns(min(lately)))
 
     def _keep(self, slot: Slot) -> None:
         for level in self._levels:

@@ -1,12 +1,14 @@
 """Gives the processes of a test a wall clock of their own: Linux has no namespace for it.
 
-Owns: a library that is loaded before all others (ld.so(8), LD_PRELOAD) and adds CLOCK_AHEAD_NS to
-CLOCK_REALTIME. What waits until a time of that clock waits as long as with the true one.
+Owns: a library that is loaded before all others (ld.so(8), LD_PRELOAD) and adds what is in the file
+CLOCK_AHEAD_FILE, nanoseconds, to CLOCK_REALTIME. What waits until a time of that clock waits as
+long as with the true one.
 """
 
 from __future__ import annotations
 
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -15,19 +17,26 @@ import pytest
 _SOURCE = r"""
 #define _GNU_SOURCE
 #include <dlfcn.h>
+#include <fcntl.h>
 #include <pthread.h>
 #include <semaphore.h>
 #include <stdlib.h>
+#include <sys/mman.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
 #include <time.h>
 #include <unistd.h>
 
-static long long ahead;
+static const long long none;
+static const volatile long long *ahead = &none;
 
 __attribute__((constructor)) static void begin(void) {
-  const char *text = getenv("CLOCK_AHEAD_NS");
-  ahead = text ? atoll(text) : 0;
+  const char *path = getenv("CLOCK_AHEAD_FILE");
+  int file = path ? open(path, O_RDONLY | O_CLOEXEC) : -1;
+  void *found = MAP_FAILED;
+  if (file >= 0) found = mmap(NULL, sizeof *ahead, PROT_READ, MAP_SHARED, file, 0);
+  if (file >= 0) close(file);
+  if (found != MAP_FAILED) ahead = found;
 }
 
 static void add(struct timespec *at, long long ns) {
@@ -38,7 +47,7 @@ static void add(struct timespec *at, long long ns) {
 
 int clock_gettime(clockid_t id, struct timespec *at) {
   int error = syscall(SYS_clock_gettime, id, at);
-  if (!error && (id == CLOCK_REALTIME || id == CLOCK_REALTIME_COARSE)) add(at, ahead);
+  if (!error && (id == CLOCK_REALTIME || id == CLOCK_REALTIME_COARSE)) add(at, *ahead);
   return error;
 }
 
@@ -61,7 +70,7 @@ time_t time(time_t *at) {
 /* Until a time of the monotonic clock, which is small, or of the other one. */
 static struct timespec kernel(const struct timespec *until) {
   struct timespec at = *until;
-  if (at.tv_sec > 1000000000) add(&at, -ahead);
+  if (at.tv_sec > 1000000000) add(&at, -*ahead);
   return at;
 }
 
@@ -82,8 +91,8 @@ int sem_timedwait(sem_t *restrict sem, const struct timespec *restrict until) {
 """
 
 
-def other_clock(directory: Path, ahead_s: float) -> dict[str, str]:
-    """Return what gives a process that is started with it, and its children, another clock.
+class OtherClock:
+    """A clock for processes that are started with `variables`, and for their children.
 
     Skips the test where there is no compiler.
 
@@ -91,12 +100,24 @@ def other_clock(directory: Path, ahead_s: float) -> dict[str, str]:
         directory: to build in.
         ahead_s: of the true clock, seconds; negative is behind.
     """
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("a clock of its own needs a C compiler: install gcc")
-    source, library = directory / "other_clock.c", directory / "other_clock.so"
-    source.write_text(_SOURCE)
-    subprocess.run(
-        [compiler, "-shared", "-fPIC", "-O2", "-o", str(library), str(source), "-ldl"], check=True
-    )
-    return {"LD_PRELOAD": str(library), "CLOCK_AHEAD_NS": str(round(ahead_s * 1e9))}
+
+    def __init__(self, directory: Path, ahead_s: float = 0.0) -> None:
+        compiler = shutil.which("cc") or shutil.which("gcc")
+        if compiler is None:
+            pytest.skip("a clock of its own needs a C compiler: install gcc")
+        directory.mkdir(exist_ok=True)
+        source, library = directory / "other_clock.c", directory / "other_clock.so"
+        source.write_text(_SOURCE)
+        subprocess.run(
+            [compiler, "-shared", "-fPIC", "-O2", "-o", str(library), str(source), "-ldl"],
+            check=True,
+        )
+        self._ahead = directory / "ahead"
+        self._ahead.write_bytes(bytes(8))
+        self.set(ahead_s)
+        self.variables = {"LD_PRELOAD": str(library), "CLOCK_AHEAD_FILE": str(self._ahead)}
+
+    def set(self, ahead_s: float) -> None:
+        """Set it; at once, also for processes that run."""
+        with self._ahead.open("r+b", buffering=0) as file:
+            file.write(struct.pack("q", round(ahead_s * 1e9)))

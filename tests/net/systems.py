@@ -6,7 +6,8 @@ for more: HOLD_CONFIGURE_FILE holds configure until that file is there, HOLD_STA
 another stage, all for HOLD_S seconds at most, and FAIL_CONFIGURE makes configure fail.
 
 `Stamped` and `Timed` are N1 and N2 that know the true delay, by a clock that all hosts of this
-machine share; with BUSY_S `Timed` is busy for so long now and then. `SimulatedTime` publishes a
+machine share; with BUSY_S `Timed` is busy for so long now and then, or once BUSY_FILE is there.
+`SimulatedTime` publishes a
 time that is far from any clock's.
 """
 
@@ -118,7 +119,8 @@ class Timed(Sink):
         self._count += 1
         if self._count % 10 == 0:
             print(f"median {statistics.median(self._delays_ms)}", flush=True)
-            time.sleep(float(os.environ.get("BUSY_S", "0")))
+            if Path(os.environ.get("BUSY_FILE", "/")).exists():
+                time.sleep(float(os.environ.get("BUSY_S", "0")))
 
 
 class SimulatedTime(LifecycleNode):

@@ -1,8 +1,9 @@
-"""Delays between two hosts whose clocks are half a second apart."""
+"""Delays between two hosts whose clocks are half a second apart, or are set while they run."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import signal
 import time
@@ -16,14 +17,14 @@ from lifecycle.errors import ExitCode
 from lifecycle.supervisor.control.client import look
 from lifecycle.verify.verdict import FlowMeasurement
 from tests.net.hosts import Host
-from tests.net.other_clock import other_clock
+from tests.net.other_clock import OtherClock
 from tests.net.running import article, run_directory, up_on, verb_on
 from tests.ros.supervisor.running import Up
 
 _BOUND_MS = 40
 """Kept on a machine that is busy, too, and far less than the clocks are apart."""
 
-_EDIT = {
+_EDIT: dict[str, Any] = {
     "nodes/n1/run": {"python": "tests.net.systems:Stamped"},
     "nodes/n2/run": {"python": "tests.net.systems:Timed"},
     "links": [
@@ -50,14 +51,19 @@ def _apart(
 ) -> Iterator[tuple[Up, Up]]:
     """Bring the article up with the clock of its publisher's host ahead."""
     manifest = article(directory, pair[0].ipv4, pair[1].ipv4, edit={**_EDIT, **edit})
-    clock: Mapping[str, str] = other_clock(directory, ahead_s)
+    clock = OtherClock(directory / "clock", ahead_s)
     with (
-        up_on(
-            pair[0], manifest, "--machine", "a", runtime=directory / "a", variables=clock
-        ) as up_a,
-        up_on(pair[1], manifest, "--machine", "b", runtime=directory / "b") as up_b,
+        _up(pair[0], manifest, "a", clock.variables) as up_a,
+        _up(pair[1], manifest, "b") as up_b,
     ):
         yield up_a, up_b
+
+
+def _up(
+    host: Host, manifest: Path, machine: str, variables: Mapping[str, str] | None = None
+) -> contextlib.AbstractContextManager[Up]:
+    runtime = manifest.parent / machine
+    return up_on(host, manifest, "--machine", machine, runtime=runtime, variables=variables)
 
 
 def _measured(directory: Path, machine: str) -> FlowMeasurement | None:
@@ -117,15 +123,68 @@ def test_data_that_are_used_late_are_found_whatever_the_clocks_say(
         assert up_b.finish() == ExitCode.VIOLATED
 
 
+@pytest.mark.parametrize("whose", ["a", "b"])
+def test_a_clock_that_is_set_meanwhile_makes_no_delay_that_is_kept_seem_too_long(
+    pair: tuple[Host, Host], tmp_path: Path, whose: str
+) -> None:
+    deep = {"preset": "sensor_data", "depth": 100}
+    type_ = "std_msgs/msg/String"
+    edit = {
+        **_EDIT,
+        "nodes/n2/run/environment": {"BUSY_S": "0.5", "BUSY_FILE": str(tmp_path / "busy")},
+        "nodes/n2/interface/subscriptions": [
+            {"name": "video", "type": type_, "qos": deep},
+            {"name": "battery", "type": type_},
+        ],
+        "links": [{**_EDIT["links"][0], "max_delay_ms": 300}, _EDIT["links"][1]],
+    }
+    manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
+    clock = OtherClock(tmp_path / "clock")
+    of = {whose: clock.variables}
+    with (
+        _up(pair[0], manifest, "a", of.get("a")) as up_a,
+        _up(pair[1], manifest, "b", of.get("b")) as up_b,
+    ):
+        for up in (up_a, up_b):
+            up.until("system", reached="active")
+        for ahead_s in (1.0, 0.0):
+            _until(tmp_path, "ok")
+            clock.set(ahead_s)
+            _until(tmp_path, "unverifiable")
+        _until(tmp_path, "ok")
+        up_b.catch_up()
+        verdicts = up_b.of_kind("verdict")
+        found = [each for verdict in verdicts for each in verdict["verdict"]["findings"]]
+        assert "flow.not-measured" in {each["rule"] for each in found}
+        wrong = ("flow.delay", "flow.rate", "flow.silent")
+        assert [each["message"] for each in found if each["rule"] in wrong] == []
+        (tmp_path / "busy").touch()
+        _until(tmp_path, "violated", within_s=_FOUND_S)
+        up_b.until_found("flow.delay")
+
+
+_FOUND_S = 4.0
+"""2 s, and as much on a machine that is busy."""
+
+
+def _until(directory: Path, outcome: str, within_s: float = 30.0) -> None:
+    """Wait until the delay of the video is judged so."""
+    until_s = time.monotonic() + within_s
+    while True:
+        flow = _measured(directory, "b")
+        found = [] if flow is None else [each.outcome for each in flow.bounds]
+        if found == [outcome]:
+            return
+        assert time.monotonic() < until_s, f"{found}, not {outcome} within {within_s} s"
+        time.sleep(0.1)
+
+
 def test_what_a_publisher_elsewhere_missed_while_it_was_paused_is_no_fault(
     pair: tuple[Host, Host], tmp_path: Path
 ) -> None:
     kept = {"topic": "/video", "from": "n1", "to": "n2", "rate_hz": 20, "max_silence_s": 1.5}
     manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit={**_EDIT, "links": [kept]})
-    with (
-        up_on(pair[0], manifest, "--machine", "a", runtime=tmp_path / "a") as up_a,
-        up_on(pair[1], manifest, "--machine", "b", runtime=tmp_path / "b") as up_b,
-    ):
+    with _up(pair[0], manifest, "a") as up_a, _up(pair[1], manifest, "b") as up_b:
         for up in (up_a, up_b):
             up.until("system", reached="active")
         verb_on(pair[0], "pause", "article", runtime=tmp_path / "a")
@@ -141,3 +200,13 @@ def test_what_a_publisher_elsewhere_missed_while_it_was_paused_is_no_fault(
             for each in verdict["verdict"]["findings"]
         ]
         assert {"flow.rate", "flow.silent"}.isdisjoint(found)
+        # Whoever has the subscription, the rate shows on both hosts.
+        for host, machine in zip(pair, "ab", strict=True):
+            shown = verb_on(
+                host, "flows", "article", "--format", "json", runtime=tmp_path / machine
+            )
+            assert shown.returncode == ExitCode.OK, shown.stderr
+            rates = {
+                each["topic"]: each["measured"]["rate_hz"] for each in json.loads(shown.stdout)
+            }
+            assert rates["/video"] > 20, (machine, rates)

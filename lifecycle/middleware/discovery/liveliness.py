@@ -57,7 +57,7 @@ ASSERTED_EACH_S = 0.06
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
 
-_Ns = typing.Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+_Number = typing.Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 
 _Port = typing.Annotated[int, msgspec.Meta(ge=0, le=65535)]
 
@@ -68,12 +68,14 @@ class AliveNotice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     Attributes:
         silent: which of its nodes are silent, and why each is.
         received: when the last notice of each other machine was sent, on that one's clock, and
-            received, on the sender's; ns.
+            received, on the sender's, ns; and its `asks`.
+        asks: how often the sender has asked what time it is: others answer each question at once.
         marks: ports on which it receives marked datagrams, over IPv4 and IPv6; 0 for none.
     """
 
     silent: Mapping[str, str]
-    received: Mapping[str, tuple[_Ns, _Ns]] = {}
+    received: Mapping[str, tuple[_Number, _Number, _Number]] = {}
+    asks: _Number = 0
     marks: tuple[_Port, _Port] = (0, 0)
 
 

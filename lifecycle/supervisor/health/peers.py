@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
 from lifecycle.measure.clock import ClockComparison, ClockOffset
@@ -62,6 +63,10 @@ SAID_AFTER_S = (0.0, 0.1, 0.4)
 EXCHANGED_S = 1.0
 """Clocks are compared so often, where a delay between machines is declared, and marks are sent,
 where a DSCP is."""
+
+ASKED_S = (0.25, 0.25, 0.5)
+"""An answer to what time it is elsewhere is waited for so long before it is asked again: a notice
+may be lost, or wait in the queue of a congested network."""
 
 FAILED = "failed: "
 """How the reason of a supervisor begins whose run failed."""
@@ -109,8 +114,11 @@ class Peers:
         self._attached: dict[str, _Peer] = {}
         self._announcements: list[AlivePublisher] = []
         self._silent: Mapping[str, str] = {}
-        self._received: dict[str, tuple[int, int]] = {}
+        self._received: dict[str, tuple[int, int, int]] = {}
         self._clocks: dict[str, ClockComparison] = {}
+        self._asks = self._awaited = 0
+        self._answers: dict[str, int] = {}
+        self._answered = asyncio.Event()
         self._exchanging: asyncio.TimerHandle | None = None
         self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
@@ -287,7 +295,10 @@ class Peers:
         from lifecycle.middleware.discovery.liveliness import AliveNotice
 
         notice = AliveNotice(
-            silent=self._silent, received=self._received, marks=self._marks.own_ports
+            silent=self._silent,
+            received=self._received,
+            asks=self._asks,
+            marks=self._marks.own_ports,
         )
         for each in self._announcements:
             each.notify(notice)
@@ -312,11 +323,34 @@ class Peers:
         if not machine:
             return
         self._marks.ports[machine] = notice.marks
-        self._received[machine] = (sent_ns, received_ns)
+        *_, answered = self._received.get(machine, (0, 0, 0))
+        self._received[machine] = (sent_ns, received_ns, notice.asks)
+        if notice.asks != answered:
+            self._notify()
         clock = self._clocks.setdefault(machine, ClockComparison())
         for own in self._own:
             if own in notice.received:
-                clock.add(*notice.received[own], sent_ns, received_ns)
+                t1_ns, t2_ns, self._answers[machine] = notice.received[own]
+                clock.add(t1_ns, t2_ns, sent_ns, received_ns)
+        if not self._lacks_answers():
+            self._answered.set()
+
+    def _lacks_answers(self) -> bool:
+        """Whether a supervisor that is there has not answered the question that is waited for."""
+        return any(
+            each.alive and self._answers.get(each.machine, self._awaited) < self._awaited
+            for each in self._supervisors
+        )
+
+    async def compare_clocks(self) -> None:
+        """Compare clocks by exchanges that begin now, within all of ASKED_S."""
+        self._awaited = self._asks + 1
+        for wait_s in ASKED_S:
+            self._asks += 1
+            self._answered.clear()
+            self._notify()
+            if not self._lacks_answers() or await set_within(self._answered, wait_s):
+                return
 
     def follow(self, flows: Iterable[FlowReport]) -> None:
         """Take the flows as they were verified just now."""

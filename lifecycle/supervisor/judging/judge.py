@@ -28,6 +28,7 @@ from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.health import UNHEALTHY
 from lifecycle.verify.rules.matching import UNKNOWN_PEER
+from lifecycle.verify.rules.measured import decided_by_clocks
 from lifecycle.verify.verdict import FindingKey, Stage, Verdict
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class Judge:
         self._peers = peers
         self._standstill = Standstill()
         self._stills = 0
+        self._decided: frozenset[object] = frozenset()  # by clocks, as they were confirmed
         self.seen = Observation()
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
@@ -122,14 +124,23 @@ class Judge:
         if self._looker is not None:
             self._looker.look(observation)
         expected = system.expected
-        verdict = verify(
-            expected,
-            observation,
-            stage=stage,
-            machines=system.machines,
-            ahead=system.run.ahead,  # as of now: some are activated meanwhile
-            over=system.over(),
-        )
+
+        def verified(observation: Observation) -> Verdict:
+            return verify(
+                expected,
+                observation,
+                stage=stage,
+                machines=system.machines,
+                ahead=system.run.ahead,  # as of now: some are activated meanwhile
+                over=system.over(),
+            )
+
+        verdict = verified(observation)
+        if not decided_by_clocks(verdict.measured) <= self._decided:
+            await self._peers.compare_clocks()
+            self.seen = replace(observation, clocks=self._peers.clocks())
+            verdict = verified(self.seen)
+        self._decided = decided_by_clocks(verdict.measured)
         self._peers.follow(verdict.flows)
         # Where nothing is declared, hosts do not report what they count.
         if not is_measured or not (expected.bounds or observation.marks):

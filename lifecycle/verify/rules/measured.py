@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
 
 from lifecycle.manifest.model import EndpointKind, Executor, Quantity, TargetState
 from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
-from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
+from lifecycle.measure.flows import FlowMeasurement, MeasuredBound, Pair
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.dscp import describe
 from lifecycle.network.five_qi import five_qi_of
@@ -299,6 +299,22 @@ def measurements(view: View) -> tuple[FlowMeasurement, ...]:
             )
         )
     return tuple(found)
+
+
+def decided_by_clocks(
+    measured: Iterable[FlowMeasurement],
+) -> frozenset[tuple[Pair, Kind, str]]:
+    """Return the outcomes of bounds that were decided by what is known of the clocks of two hosts.
+
+    What is known may be from before a clock was set, and is confirmed by an exchange that begins
+    after the last message of the sample.
+    """
+    return frozenset(
+        (flow.pair, bound.kind, bound.outcome)
+        for flow in measured
+        for bound in flow.bounds
+        if flow.clock is not None and bound.kind in _DELAYS
+    )
 
 
 def _corrected(sample: Sample, quantile: float, clock: ClockOffset | None) -> float | None:

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.measure.bounds import CLOCKS_S, Bound, Judgement, Kind, judge
-from lifecycle.measure.clock import SAME_CLOCK, ClockComparison, ClockOffset
+from lifecycle.measure.clock import JUDGED_S, SAME_CLOCK, ClockComparison, ClockOffset
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, least_ns, signed_buckets_of
-from lifecycle.measure.sample import DELAY_S, Sample
+from lifecycle.measure.sample import Sample
 
 NS = 10**9
 START = 1_700_000_000 * NS
@@ -69,7 +69,7 @@ def test_the_true_offset_is_within_the_uncertainty_however_asymmetric_the_ways_a
         assert abs(hosts.offset_ns(now_ns) / 1e6 - found.offset_ms) <= found.uncertainty_ms
     now_ns += later_ns
     found = hosts.known(now_ns)
-    for at_ns in (now_ns, now_ns - round(DELAY_S * NS)):
+    for at_ns in (now_ns, now_ns - round(JUDGED_S * NS)):
         assert abs(hosts.offset_ns(at_ns) / 1e6 - found.offset_ms) <= found.uncertainty_ms
 
 
@@ -79,12 +79,14 @@ def test_the_uncertainty_is_half_of_the_shortest_round_trip_and_what_clocks_may_
         now_ns = hosts.exchange(START + second * NS, 100_000 + slow_ns, 0, 100_000 + slow_ns)
     found = hosts.known(now_ns)
     assert found.offset_ms == pytest.approx(500, abs=0.001)
-    assert 0.1 < found.uncertainty_ms < 0.1 + 100e-6 * 7100
-    later = hosts.known(now_ns + 20 * NS)  # delays of 5 s before are judged, too
-    assert later.uncertainty_ms - found.uncertainty_ms == pytest.approx(100e-6 * 15_000, rel=0.1)
+    assert 0.1 < found.uncertainty_ms < 0.1 + 100e-6 * (2100 + 1000 * JUDGED_S)
+    later = hosts.known(now_ns + 20 * NS)  # delays of some seconds before are judged, too
+    assert later.uncertainty_ms - found.uncertainty_ms == pytest.approx(
+        100e-6 * (20_000 - 1000 * JUDGED_S), rel=0.1
+    )
     near = Hosts(500_000_000)
     at_once = near.known(near.exchange(START, 0, 0, 0))
-    assert at_once == ClockOffset(offset_ms=500.0, uncertainty_ms=0.5000025)
+    assert at_once == ClockOffset(offset_ms=500.0, uncertainty_ms=0.1 * JUDGED_S + 2.5e-6)
 
 
 def test_nothing_is_known_before_an_exchange() -> None:
@@ -97,7 +99,7 @@ def test_what_was_proven_before_messages_queue_holds_on_but_for_what_clocks_may_
     for second in range(1, 61):  # a link that is congested in one direction
         now_ns = hosts.exchange(START + second * NS, 300_000_000, 0, 100_000)
     found = hosts.known(now_ns)
-    assert found.uncertainty_ms < 0.1 + 100e-6 * 65_000 + 0.1
+    assert found.uncertainty_ms < 0.1 + 100e-6 * (60_000 + 1000 * JUDGED_S) + 0.1
     assert abs(found.offset_ms - 500) <= found.uncertainty_ms
 
 
@@ -111,7 +113,8 @@ def test_a_clock_that_is_set_makes_what_was_known_of_it_void_until_old_delays_ar
     hosts.ahead_ns += step_ns
     now_ns = hosts.exchange(now_ns + NS, 200_000, 0, 200_000)
     assert hosts.comparison.offset(now_ns) is None
-    for _ in range(6):
+    for second in range(7):
+        assert hosts.comparison.offset(now_ns) is None, second
         now_ns = hosts.exchange(now_ns + NS, 200_000, 0, 200_000)
     assert hosts.known(now_ns).offset_ms == pytest.approx(7 + step_ns / 1e6, abs=0.5)
 
@@ -203,12 +206,39 @@ def test_rate_and_loss_do_not_depend_on_the_other_clock(ahead_ns: int) -> None:
     assert found_ms + ahead_ns / 1e6 == pytest.approx(1.5, abs=0.05)
 
 
-def test_small_delays_keep_small_buckets_after_long_ones_or_a_clock_that_was_set_back() -> None:
-    late = [(at_s, 4000.0) for at_s, _ in steady(0, 1)]
-    then = [(1 + at_s, 3.0) for at_s, _ in steady(3.0)]
-    sample = counted([*late, *then], ahead_ns=0, until_s=6, network=1.0)
-    assert sample.used.quantile_ms(0.99) == pytest.approx(3.0, abs=0.01)
-    assert sample.messages == 300
+@pytest.mark.parametrize(
+    ("before_ms", "delay_ms", "error_ms"),
+    [(4000.0, 3.0, 0.01), (3.0, 4000.0, 1.1), (1.0, 3.6e6, 1.1), (1.0, 2e7, 0.01)],
+)
+def test_delays_have_small_buckets_again_after_a_clock_was_set(
+    before_ms: float, delay_ms: float, error_ms: float
+) -> None:
+    before = [(at_s, before_ms) for at_s, _ in steady(0, 1)]
+    then = [(1 + at_s, delay_ms) for at_s, _ in steady(0, 6)]
+    sample = counted([*before, *then], ahead_ns=0, until_s=8, network=1.0)
+    assert sample.used.quantile_ms(0.99) == pytest.approx(delay_ms, abs=error_ms)
+    assert sample.messages == 350
+
+
+def test_no_message_is_forgotten_where_delays_differ_by_more_than_small_buckets_hold() -> None:
+    delays_ms = [each for each in (3.0, 300.0, 5.0, 600.0, 3.0) for _ in range(50)]
+    arrivals = [(at_s, delay_ms) for (at_s, _), delay_ms in zip(steady(0), delays_ms, strict=True)]
+    sample = counted(arrivals, ahead_ns=0, until_s=5.5)
+    assert sample.used.messages >= 200
+    for quantile, delay_ms in ((0.3, 3.0), (0.45, 5.0), (0.6, 300.0), (0.99, 600.0)):
+        found_ms = sample.used.quantile_ms(quantile)
+        assert found_ms is not None
+        assert delay_ms - 2 * 600 * ERROR < found_ms <= delay_ms
+
+
+def test_what_arrives_after_our_own_clock_was_set_back_is_counted() -> None:
+    counter = Counter(0, START, is_apart=True)
+    for number in range(1, 4):
+        now_ns = number * NS
+        wall_ns = START + now_ns - HOUR
+        info = dict.fromkeys(("source_timestamp", "received_timestamp"), wall_ns)
+        counter.arrived(now_ns, wall_ns, {**info, "publication_sequence_number": number})
+    assert counter.sample(4 * NS).messages == 3
 
 
 BOUND = Bound(kind=Kind.DELAY, most=5.0)

@@ -79,7 +79,8 @@ class FakeAir:
     def __init__(self) -> None:
         self.watched: dict[str, SimpleNamespace] = {}
         self.announced: dict[str, list[Mapping[str, str]]] = {}
-        self.received: list[dict[str, tuple[int, int]]] = []
+        self.received: list[dict[str, tuple[int, int, int]]] = []
+        self.asks = 0
         self.plans: list[str] = []
         self.arrives: Callable[[str], None] | None = None
         self.done: list[str] = []
@@ -90,6 +91,7 @@ class FakeAir:
         def notify(notice: AliveNotice) -> None:
             said.append(dict(notice.silent))
             self.received.append(dict(notice.received))
+            self.asks = notice.asks
 
         return SimpleNamespace(notify=notify, destroy=lambda: None)
 
@@ -99,8 +101,8 @@ class FakeAir:
             alive=callbacks["on_liveliness"],
             left=callbacks["on_left"],
             silent=lambda silent: on_notice(AliveNotice(silent=silent), 0, 0),
-            times=lambda sent_ns, received_ns, theirs: on_notice(
-                AliveNotice(silent={}, received=theirs), sent_ns, received_ns
+            times=lambda sent_ns, received_ns, theirs, asks=0: on_notice(
+                AliveNotice(silent={}, received=theirs, asks=asks), sent_ns, received_ns
             ),
             destroy=lambda: self.watched.pop(topic),
         )

@@ -5,15 +5,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import Health
+from lifecycle.manifest.model import Health, Machine, Quantity
+from lifecycle.measure.clock import ClockOffset
+from lifecycle.measure.delays import Delays
+from lifecycle.measure.sample import Measured, Sample
 from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.health.peers import Peers
 from lifecycle.supervisor.judging.grace_period import PASSING_S
-from lifecycle.supervisor.judging.judge import HEALTH_S, without
+from lifecycle.supervisor.judging.judge import HEALTH_S, Judge, without
 from lifecycle.verify.observation import (
     HealthReport,
     NodeParameters,
@@ -23,9 +28,20 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage, Verdict
-from tests.builders import configuration, plan_of, planned_node
+from tests.builders import (
+    at,
+    configuration,
+    link,
+    node,
+    plan_of,
+    planned,
+    planned_node,
+    publisher,
+    subscription,
+)
 from tests.unit.supervisor.fakes import World, verdict, verdict_of
-from tests.unit.supervisor.session_world import CHAIN, SessionWorld
+from tests.unit.supervisor.session_world import CHAIN, FakeAir, SessionWorld
+from tests.unit.verify.perfect import perfect
 
 OK = verdict_of(Outcome.OK)
 MISSING = verdict_of(Outcome.VIOLATED, "graph.missing-node")
@@ -153,6 +169,57 @@ async def test_what_a_process_left_in_the_graph_counts_no_more(tmp_path: Path) -
         world.kill("camera")
         await world.story.until("[verdict] active violated graph.missing-node /camera")
     assert world.graph.forgotten[0] == world.hosts.processes["camera"].pid
+
+
+@pytest.mark.parametrize(
+    ("apart_ms", "outcome"), [(500, "violated"), (460, "ok"), (None, "measuring")]
+)
+async def test_what_clocks_decide_is_judged_once_they_were_compared_after_the_last_message(
+    tmp_path: Path, apart_ms: float | None, outcome: str
+) -> None:
+    number = Quantity(name="max_delay_ms", value=40.0, at=at(9))
+    plan = planned(
+        node("camera", publisher("/video"), machine="robot"),
+        node("viewer", subscription("/video"), machine="desk"),
+        links=[link("/video", "camera", "viewer", quantities=(number,))],
+        machines=tuple(Machine(name=each, at=at(2)) for each in ("robot", "desk")),
+    )
+    late = Delays(seconds=5.0, buckets=((0, 300),), shift_ns=-450_000_000)
+    sample = Sample(seconds=6.0, messages=300, used=late, received=late)
+    measured = Measured(active_s=6.0, samples=(("/video", sample),))
+    seen = perfect(plan, Stage.ACTIVE)
+    reports = (replace(each, measured=measured) for each in seen.configurations)
+    seen = replace(seen, configurations=tuple(reports))
+    compared: list[float | None] = []
+
+    class Compared(Peers):
+        """The clocks seemed to be 500 ms apart before they are compared."""
+
+        def clocks(self) -> tuple[tuple[str, ClockOffset], ...]:
+            now_ms = compared[-1] if compared else 500
+            return () if now_ms is None else (("robot", ClockOffset(offset_ms=now_ms)),)
+
+        async def compare_clocks(self) -> None:
+            compared.append(apart_ms)
+
+    async def observe(*_: object, **__: object) -> Observation:
+        return seen
+
+    system = World(
+        plan, tmp_path, [each for each in plan.processes if each.machine == "desk"]
+    ).system
+    system.run.held_s, system.run.passage = 0.0, None
+    graph: Any = SimpleNamespace(observe=observe)
+    air: Any = FakeAir()
+    peers = Compared(system, air)
+    peers.open()
+    judge = Judge(system, graph, looker=None, peers=peers)
+    for _ in range(2):  # the second time nothing is new
+        (flow,) = (await judge.look(Stage.ACTIVE)).measured
+        assert [each.outcome for each in flow.bounds] == [outcome]
+        assert compared == [apart_ms]
+    judge.close()
+    await peers.close()
 
 
 def test_a_dead_node_is_gone_although_discovery_shows_it_and_a_second_one_stays() -> None:

@@ -447,10 +447,10 @@ async def test_clocks_are_compared_once_a_second_while_a_delay_between_machines_
     await settle()
     assert robot.peers.clocks() == ()  # it has not received ours yet
     await asyncio.sleep(1.1 * EXCHANGED_S)
-    assert robot.air.received[1:] == [{"desk": (now_ns + NS, now_ns)}]
+    assert robot.air.received[1:] == [{"desk": (now_ns + NS, now_ns, 0)}]
     # It got ours after 1 ms, and its answer was here after 1 ms, by a clock that is 1 s ahead.
     sent_ns = now_ns + NS // 10
-    ours = {"robot": (sent_ns, sent_ns + NS + NS // 1000), "other": (1, 2)}
+    ours = {"robot": (sent_ns, sent_ns + NS + NS // 1000, 0), "other": (1, 2, 0)}
     robot.desk.times(sent_ns + 2 * NS, sent_ns + NS + NS // 1000, ours)
     await settle()
     ((machine, offset),) = robot.peers.clocks()
@@ -460,3 +460,48 @@ async def test_clocks_are_compared_once_a_second_while_a_delay_between_machines_
     robot.peers.announce()
     await asyncio.sleep(1.1 * EXCHANGED_S)
     assert len(robot.air.received) == 2
+
+
+async def test_who_asks_for_a_comparison_of_clocks_is_answered_at_once_and_only_once(
+    tmp_path: Path,
+) -> None:
+    robot = Robot(tmp_path, with_delay(two_machines()))
+    now_ns = time.time_ns()
+    for asks, answered in ((0, []), (1, [1]), (1, []), (2, [2])):
+        before = len(robot.air.received)
+        robot.desk.times(now_ns, now_ns, {}, asks)
+        await settle()
+        answers = [each["desk"][2] for each in robot.air.received[before:]]
+        assert answers == answered
+    await robot.peers.close()
+
+
+@pytest.mark.parametrize(
+    ("answers", "compared_s"),
+    [
+        ([(0.1, 1)], 0.1),
+        ([(0.1, 0), (0.2, 1)], 0.2),  # the first was on its way before we asked
+        ([(0.3, 1)], 0.3),  # it was asked again meanwhile
+        ([(0.6, 3)], 0.6),  # what asked before was lost
+        ([], 1.0),
+    ],
+)
+async def test_clocks_are_compared_by_an_exchange_that_begins_now_if_there_is_an_answer(
+    tmp_path: Path, answers: list[tuple[float, int]], compared_s: float
+) -> None:
+    robot = Robot(tmp_path, with_delay(two_machines()))
+    loop, began_s = asyncio.get_running_loop(), asyncio.get_running_loop().time()
+    await robot.peers.compare_clocks()
+    assert loop.time() == began_s  # nobody is there
+    await robot.alive(True)
+    now_ns = time.time_ns()
+    robot.desk.times(now_ns, now_ns, {"robot": (now_ns, now_ns, robot.air.asks)})
+    await settle()
+    before = robot.air.asks
+    for after_s, number in answers:
+        echo = {"robot": (now_ns, now_ns, before + number)}
+        loop.call_later(after_s, robot.desk.times, now_ns, now_ns, echo)
+    began_s = loop.time()
+    await robot.peers.compare_clocks()
+    assert loop.time() - began_s == pytest.approx(compared_s)
+    await robot.peers.close()

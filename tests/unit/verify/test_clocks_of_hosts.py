@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import Machine, Policy, Quantity
 from lifecycle.measure.bounds import CLOCKS_S
-from lifecycle.measure.clock import ClockOffset
+from lifecycle.measure.clock import ClockComparison, ClockOffset
+from lifecycle.measure.counter import Counter
 from lifecycle.measure.delays import Delays, signed_buckets_of
 from lifecycle.measure.sample import Measured, Sample
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import apart_from_numbers, verify
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules.measured import compares_clocks
+from lifecycle.verify.rules.measured import compares_clocks, decided_by_clocks
 from lifecycle.verify.verdict import Stage, Verdict
 from tests.builders import at, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import both, change_configuration
@@ -53,16 +59,24 @@ def judged(
     """Judge as the supervisor of a machine does; delays are those of the robot at +512 ms."""
     raw_ns = round(delay_ms * MS) - 512 * MS - SHIFT_NS
     used = Delays(seconds=5.0, buckets=((signed_buckets_of((raw_ns,))[0], 300),), shift_ns=shift_ns)
-    measured = Measured(
-        active_s=seconds,
-        samples=(("/video", Sample(seconds=seconds, messages=300, used=used, received=used)),),
-    )
+    sample = Sample(seconds=seconds, messages=300, used=used, received=used)
+    return verified(plan, sample, clocks if is_up else None, own)
+
+
+def verified(
+    plan: Plan,
+    sample: Sample,
+    clocks: tuple[tuple[str, ClockOffset], ...] | None,
+    own: str = "station",
+) -> Verdict:
+    """Judge what the viewer has counted."""
+    measured = Measured(active_s=sample.seconds, samples=(("/video", sample),))
     seen = perfect(plan, Stage.ACTIVE)
     reports = tuple(
         replace(each, measured=measured) if each.name == "/viewer" else each
         for each in seen.configurations
     )
-    seen = replace(seen, configurations=reports, clocks=clocks if is_up else None)
+    seen = replace(seen, configurations=reports, clocks=clocks)
     return verify(plan, seen, stage=Stage.ACTIVE, machines=frozenset({own}))
 
 
@@ -178,3 +192,139 @@ def test_clocks_are_compared_where_a_delay_is_declared_and_data_pass_between_mac
     assert compares_clocks(system(name="five_qi", max_delay_ms=82))
     assert not compares_clocks(system(name="rate_hz"))
     assert not compares_clocks(system(viewer="robot"))
+
+
+WAY_NS = MS // 5
+SECOND = 1000 * MS
+ENDS_NS = 24 * SECOND
+SOUND_NS, LATE_NS = MS, 50 * MS
+PLAN = system(max_delay_ms=5.0)
+KEPT, BROKEN = "ok", "violated"
+
+
+class Hosts:
+    """The robot, the station, the rate of the video, and a clock of one of them that is set.
+
+    Times are nanoseconds of a clock that is never set.
+    """
+
+    def __init__(self, rate_hz: int, whose: str, set_by_ns: int, set_at_ns: int) -> None:
+        self.period_ns = SECOND // rate_hz
+        self._whose, self._set_by_ns, self._set_at_ns = whose, set_by_ns, set_at_ns
+        self.comparison = ClockComparison()
+        self.counter = Counter(0, self.clock("station", 0), is_apart=True)
+
+    def clock(self, host: str, at_ns: int) -> int:
+        is_set = host == self._whose and at_ns >= self._set_at_ns
+        return 10**18 + at_ns + (self._set_by_ns if is_set else 0)
+
+    def exchange(self, at_ns: int, waits_ns: int = 0) -> int:
+        """Have a notice of the station answered after a while; return when the answer is there."""
+        got_ns = at_ns + WAY_NS
+        sent_ns = got_ns + waits_ns
+        end_ns = sent_ns + WAY_NS
+        t2, t3 = self.clock("robot", got_ns), self.clock("robot", sent_ns)
+        self.comparison.add(self.clock("station", at_ns), t2, t3, self.clock("station", end_ns))
+        return end_ns
+
+    def message(self, number: int, sent_ns: int, delay_ns: int) -> None:
+        here_ns = self.clock("station", sent_ns + delay_ns)
+        info = {
+            "source_timestamp": self.clock("robot", sent_ns),
+            "received_timestamp": here_ns,
+            "publication_sequence_number": number,
+        }
+        self.counter.arrived(sent_ns + delay_ns, here_ns, info)
+
+    def verdict(self, sample: Sample, at_ns: int) -> Verdict:
+        offset = self.comparison.offset(self.clock("station", at_ns))
+        return verified(PLAN, sample, () if offset is None else (("robot", offset),))
+
+
+def outcomes(
+    hosts: Hosts, began: tuple[float, float, float], waits: float, late_ns: int
+) -> list[tuple[int, str]]:
+    """Judge as a supervisor does, once a second, and return when which outcome was found.
+
+    Args:
+        hosts: see there.
+        began: in which part of their period exchanges, reports of the viewer and looks begin.
+        waits: for which part of a second the robot's supervisor has its answer wait.
+        late_ns: from when on the video is late.
+    """
+    sample, decided, found = Sample(seconds=0.0), frozenset[object](), list[tuple[int, str]]()
+
+    def exchange(end_ns: int) -> None:
+        waits_ns = round(waits * SECOND)
+        hosts.exchange(end_ns - waits_ns - 2 * WAY_NS, waits_ns)
+
+    def report(at_ns: int) -> None:
+        nonlocal sample
+        sample = hosts.counter.sample(at_ns)
+
+    def look(at_ns: int) -> None:
+        nonlocal decided
+        verdict = hosts.verdict(sample, at_ns)
+        if not decided_by_clocks(verdict.measured) <= decided:
+            verdict = hosts.verdict(sample, hosts.exchange(at_ns))
+        decided = decided_by_clocks(verdict.measured)
+        found.append((at_ns, verdict.measured[0].bounds[0].outcome))
+
+    events: list[tuple[int, Callable[[int], None]]] = []
+    for do, part, period_ns in zip(
+        (exchange, report, look), began, (SECOND, SECOND // 2, SECOND), strict=True
+    ):
+        # The first exchange is over before the first look.
+        first_ns = SECOND if do is exchange else 2 * SECOND
+        times = range(first_ns + round(part * period_ns), ENDS_NS, period_ns)
+        events += [(at_ns, do) for at_ns in times]
+    for number, sent_ns in enumerate(range(0, ENDS_NS, hosts.period_ns), 1):
+        delay_ns = LATE_NS if sent_ns >= late_ns else SOUND_NS
+        message = functools.partial(hosts.message, number, sent_ns, delay_ns)
+        events.append((sent_ns + delay_ns, lambda _, message=message: message()))
+    for at_ns, do in sorted(events, key=lambda event: event[0]):
+        do(at_ns)
+    return found
+
+
+PART = st.floats(0, 0.99)
+BY = st.one_of(st.integers(-each, each) for each in (20 * MS, SECOND, 3600 * SECOND))
+
+
+def hosts_at(*rates_hz: int) -> st.SearchStrategy[Hosts]:
+    who, when = st.sampled_from(["robot", "station"]), st.integers(6 * SECOND, 12 * SECOND)
+    return st.builds(Hosts, st.sampled_from(rates_hz), who, BY, when)
+
+
+PHASES = st.tuples(PART, PART, PART)
+
+
+@settings(max_examples=20)
+@given(hosts_at(10, 50), PHASES, PART)
+def test_a_clock_that_is_set_makes_no_delay_that_is_kept_seem_too_long(
+    hosts: Hosts, began: tuple[float, float, float], waits: float
+) -> None:
+    found = outcomes(hosts, began, waits, late_ns=ENDS_NS)
+    assert BROKEN not in {outcome for _, outcome in found}
+    assert found[-1][1] == KEPT
+
+
+@settings(max_examples=20)
+@given(hosts_at(10, 50), PHASES, PART)
+def test_a_clock_that_is_set_makes_no_delay_that_is_too_long_seem_kept(
+    hosts: Hosts, began: tuple[float, float, float], waits: float
+) -> None:
+    found = outcomes(hosts, began, waits, late_ns=0)
+    assert KEPT not in {outcome for _, outcome in found}
+    assert found[-1][1] == BROKEN
+
+
+@settings(max_examples=20)
+@given(hosts_at(50), PHASES, PART)
+def test_a_delay_that_becomes_too_long_after_a_clock_was_set_is_found_within_two_seconds(
+    hosts: Hosts, began: tuple[float, float, float], waits: float
+) -> None:
+    late_ns = 20 * SECOND + SECOND // 7
+    found = outcomes(hosts, began, waits, late_ns)
+    first_ns = next(at_ns for at_ns, outcome in found if outcome == BROKEN)
+    assert late_ns < first_ns < late_ns + 2 * SECOND
