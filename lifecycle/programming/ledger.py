@@ -1,9 +1,8 @@
 """The ledger: what this package made in networks, written down before and after it is made.
 
 Owns: the file `programmed.json` in a run directory. It outlives the process, so that a removal
-deletes only what is ours, and the next run finds what a dead one left. Of tables and devices of
-this host it has the names only: what they hold is marked there. Of servers it has the body of each
-request, before it is sent, and the id that the server gave it; never a credential.
+deletes only what is ours, and the next run finds what a dead one left. It has what each flow was
+given, and of servers the id of what was made; never a credential.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ _LOCK_CHECK_S = 0.05
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing of ours at a server, for one flow.
+    """One thing of ours in a network, for one flow.
 
     Attributes:
         key: of its FlowRule.
-        id: what the server calls it, a subscription or a session; empty while it was asked for and
+        id: what a server calls it, a subscription or a session; empty while it was asked for and
             is not known to be made.
         what: for people.
         expires_s: seconds since the epoch; None if it does not expire.
-        body: what was asked for, as JSON; what finds it again while its id is not known.
+        body: what was written or asked for, of servers as JSON: it finds again what has no id yet.
     """
 
     key: str
@@ -63,12 +62,16 @@ class TargetRecord(msgspec.Struct, frozen=True, kw_only=True):
         target: "nft", "tc", "nef" or "camara".
         scope: which one of that kind: a table, a device, a URL.
         settings: path of the settings file that says how to get there; empty if none is needed.
+        found: digest of a host's table as it was after writing; empty while it is written.
+        beside: digest of what was made beside that table.
     """
 
     target: str
     scope: str
     settings: str = ""
     entries: tuple[Entry, ...] = ()
+    found: str = ""
+    beside: str = ""
 
     @property
     def network(self) -> tuple[str, str]:
@@ -151,14 +154,10 @@ class Ledger:
                 hint="look at what it lists, remove that by hand, then delete the file",
             ) from error
 
-    def has(self, record: TargetRecord) -> bool:
-        """Whether anything of ours is written of the network of a record."""
-        return any(each.network == record.network for each in self.read().targets)
-
-    def entries(self, record: TargetRecord) -> tuple[Entry, ...]:
-        """Return what is written of the network of a record."""
-        found = (each.entries for each in self.read().targets if each.network == record.network)
-        return next(found, ())
+    def find(self, record: TargetRecord) -> TargetRecord | None:
+        """Return what is written of the network of a record; None if nothing is."""
+        found = (each for each in self.read().targets if each.network == record.network)
+        return next(found, None)
 
     def put(self, record: TargetRecord) -> None:
         """Write down what is ours in one network, in place of what was written of it."""
@@ -166,7 +165,7 @@ class Ledger:
 
     def drop(self, record: TargetRecord) -> None:
         """Nothing of ours is left in the network of a record."""
-        if self.has(record):
+        if self.find(record) is not None:
             self._write(record)
 
     def _write(self, of: TargetRecord, *instead: TargetRecord) -> None:

@@ -398,7 +398,8 @@ class ServerTarget(Target):
 
     def _entries(self) -> dict[str, Entry]:
         """What is ours there, by key."""
-        return {each.key: each for each in self._ledger.entries(self._record)}
+        found = self._ledger.find(self._record)
+        return {each.key: each for each in found.entries} if found else {}
 
     def _note(self, entry: Entry) -> None:
         every = {**self._entries(), entry.key: entry}

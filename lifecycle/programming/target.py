@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import enum
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
@@ -258,17 +258,6 @@ def _either(words: Sequence[str]) -> str:
 def describe_rule(rule: FlowRule) -> str:
     """Return a rule for people: the tuple and what it gets."""
     return f"{rule.describe()}, {asks(rule)}"
-
-
-def usable(
-    rules: Iterable[FlowRule], why_not: Callable[[FlowRule], str]
-) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
-    """Return the rules that `why_not` has no reason against, and the others with their reasons."""
-    reasons = [(each, why_not(each)) for each in rules]
-    return (
-        tuple(each for each, why in reasons if not why),
-        tuple(f"{each.key}: {why}" for each, why in reasons if why),
-    )
 
 
 class ProgrammingError(LifecycleError):

@@ -25,7 +25,7 @@ from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
 from lifecycle.programming.ledger import Ledger
-from lifecycle.programming.nft import digest_of, root_qdiscs
+from lifecycle.programming.nft import NftTarget, root_qdiscs
 from lifecycle.programming.settings import load_settings
 from lifecycle.programming.target import Means, ProgrammingError
 from lifecycle.programming.tool import HostTool, ToolOutput
@@ -88,6 +88,11 @@ def _qdiscs(data: bytes, _: Path) -> object:
     return root_qdiscs(FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr=""))))
 
 
+def _nft(data: bytes, folder: Path) -> object:
+    tool = FakeTool(("nft", ToolOutput(returncode=0, stdout=_text(data), stderr="")))
+    return NftTarget(None, Means(Ledger(folder, "robot")), tool).plan([])
+
+
 def _printed(data: bytes, folder: Path) -> object:
     (folder / "out").write_bytes(data)
     return HostTool().run(["cat", str(folder / "out")])
@@ -98,7 +103,7 @@ def _tc(data: bytes, folder: Path) -> object:
 
     tool = FakeTool(
         ("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")),
-        ("nft list", failed("Error: No such file or directory")),
+        ("nft -s list", failed("Error: No such file or directory")),
     )
     settings = TcSettings(device="eth0", link_kbit=20_000)
     return TcTarget(settings, Means(Ledger(folder, "robot")), tool).plan([])
@@ -187,9 +192,9 @@ READERS: dict[str, Reader] = {
         errors=(LifecycleError,),
     ),
     "nft listing": Reader(
-        good=b'table inet flowqos_a {\n comment "managed by lifecycle digest 0123456789abcdef"\n}',
-        read=lambda data, _: digest_of(_text(data)),
-        errors=(),
+        good=b'table inet flowqos_a {\n comment "managed-by=lifecycle"\n}',
+        read=_nft,
+        errors=(LifecycleError,),
     ),
     "qdiscs of tc": Reader(good=_QDISCS, read=_qdiscs, errors=(ProgrammingError,)),
     "root qdisc of a device": Reader(

@@ -166,7 +166,7 @@ def test_a_table_that_others_changed_is_noticed_and_replaced(bench: Bench) -> No
 
     (change,) = target.apply([bench.rule()]).changes
 
-    assert (change.kind, change.detail) == (ChangeKind.UPDATE, "the table was changed by others")
+    assert (change.kind, change.detail) == (ChangeKind.UPDATE, "the table is not as it was written")
     bench.send(port=17900)
     assert bench.sent(EF) == 3
 

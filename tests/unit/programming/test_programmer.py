@@ -234,7 +234,7 @@ def test_a_ledger_keeps_targets_apart_and_vanishes_with_the_last_entry(tmp_path:
 
     ledger.put(one)
     ledger.put(other)
-    assert ledger.entries(one) == (entry,)
+    assert ledger.find(one) == one
     ledger.drop(one)
     assert ledger.read().targets == (other,)
     ledger.drop(other)

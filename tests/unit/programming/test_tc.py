@@ -9,13 +9,14 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
+from lifecycle.programming.rules import RuleSet
 from lifecycle.programming.tc import (
     TcMatch,
     TcSettings,
+    TcTarget,
     class_of,
     classes_of,
     divide,
-    render_tc,
     render_tc_removal,
 )
 from tests.unit.programming.flow_samples import (
@@ -42,7 +43,7 @@ def cannot(message: str) -> object:
 
 
 def script(case: TcSettings) -> str:
-    return render_tc(RULES, case, system="teleop", left_out=LEFT_OUT)
+    return TcTarget.export(case, RuleSet(rules=RULES, left_out=LEFT_OUT), "teleop")
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -88,7 +88,7 @@ def test_programs_read_stdin_and_speak_english() -> None:
 
 def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> None:
     listed = ToolOutput(returncode=0, stdout=json.dumps(QDISCS), stderr="")
-    tool = FakeTool(("nft list", NO_TABLE), ("tc -j qdisc show", listed))
+    tool = FakeTool(("nft -s list", NO_TABLE), ("tc -j qdisc show", listed))
 
     changes = NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()])
 
@@ -108,7 +108,7 @@ def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> Non
     def missing() -> ToolOutput:
         raise MissingFeatureError("cannot run 'tc'")
 
-    tool = FakeTool(("nft list", NO_TABLE), ("tc", missing))
+    tool = FakeTool(("nft -s list", NO_TABLE), ("tc", missing))
 
     assert NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()]).warnings == ()
 
@@ -128,7 +128,7 @@ def test_a_dry_run_that_no_privilege_can_check_says_so_in_its_first_line(tmp_pat
 
 def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
     ledger = ledger_in(tmp_path)
-    tool = FakeTool(("nft list", NO_TABLE), ("nft -f", failed("Error: no memory")))
+    tool = FakeTool(("nft -s list", NO_TABLE), ("nft -f", failed("Error: no memory")))
     target = NftTarget(None, Means(ledger), tool)
 
     with pytest.raises(ProgrammingError, match="no memory"):
