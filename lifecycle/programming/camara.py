@@ -18,16 +18,18 @@ from lifecycle.errors import LifecycleError
 from lifecycle.programming.http import ID_PATTERN, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
+from lifecycle.programming.server import (
+    Body,
+    DeviceEnd,
+    Made,
+    ServerTarget,
+    class_name,
+    differs,
+)
 from lifecycle.programming.settings import ServerSettings
-from lifecycle.programming.target import HttpError, Means, PartlyError
+from lifecycle.programming.target import HttpError, PartlyError
 
-_COMPARED = {
-    "applicationServer": "application_server",
-    "devicePorts": "device_ports",
-    "applicationServerPorts": "application_server_ports",
-    "qosProfile": "qos_profile",
-}
+_COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
 
 _MARGIN = 0.2
 """A session is prolonged when this part of what was asked for is left, …"""
@@ -73,7 +75,7 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
             raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
 
 
-class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """SessionInfo of QualityOnDemand 1.1.0, as far as it is read; None is not shown."""
 
     session_id: Annotated[str, msgspec.Meta(pattern=ID_PATTERN)]
@@ -98,11 +100,6 @@ class CamaraTarget(ServerTarget):
     kind = "camara"
     settings_type = CamaraSettings
     collection = "/sessions"
-
-    def __init__(self, settings: str, means: Means) -> None:
-        super().__init__(settings, means)
-        self._expires: dict[str, tuple[float, float]] = {}
-        """By key, when a session expires: since the epoch, and on the clock that goes forward."""
 
     @staticmethod
     def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
@@ -154,7 +151,7 @@ class CamaraTarget(ServerTarget):
         asked = {"device": body["device"]} if "device" in body else {}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
         for each in () if reply.gone else reply.read(tuple[_Session, ...]):
-            if not _differs(body, each, missing=True):
+            if not differs(body, each, _COMPARED, missing=True):
                 return self._made(each, body)
         return None
 
@@ -162,11 +159,6 @@ class CamaraTarget(ServerTarget):
         """GET it; one that has ended counts as different, for it has to be deleted first."""
         reply = self._api.request("GET", self.path(id_), may_be_gone=True)
         return None if reply.gone else self._made(reply.read(_Session), body)
-
-    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - ServerTarget
-        """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
-        self.delete(id_)
-        return self.create(body)
 
     def renew(self) -> float | None:
         """Prolong sessions that are due; return seconds until the next is.
@@ -216,13 +208,7 @@ class CamaraTarget(ServerTarget):
             return None
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
-        clock = self._api.clock
-        left_s, now_s = entry.expires_s - clock.now_s(), clock.steady_s()
-        # A clock that is set back meanwhile makes no session last longer.
-        known = self._expires.get(entry.key)
-        if known is None or known[0] != entry.expires_s:
-            known = self._expires[entry.key] = entry.expires_s, now_s + left_s
-        return min(left_s, known[1] - now_s) - margin_s
+        return entry.expires_s - self._api.clock.steady_s() - margin_s
 
     def _settled(self, session: _Session) -> _Session:
         """Ask until the session is more than requested, for a while."""
@@ -246,19 +232,15 @@ class CamaraTarget(ServerTarget):
         if granted is not None and granted < self._server.duration_s:
             detail = f"granted for {granted} s instead of {self._server.duration_s} s"
         # The latest that it can end, if nothing says when.
-        expires_s = None if granted is None else self._api.clock.now_s() + granted
+        left_s: float | None = granted
         if session.expires_at is not None:
-            expires_s = session.expires_at.timestamp()
-        return Made(id=id_, expires_s=expires_s, detail=detail, differs=_differs(body, session))
-
-
-def _differs(asked: Body, seen: _Session, *, missing: bool = False) -> str:
-    """Why what the server shows is not what was asked for; empty if it is."""
-    for key, field in _COMPARED.items():
-        found = getattr(seen, field)
-        if (found is not None or missing) and found != asked.get(key):
-            return f"the server has {key} {text_of(str(found))!r}"
-    return ""
+            left_s = session.expires_at.timestamp() - self._api.clock.now_s()
+        return Made(
+            id=id_,
+            expires_s=None if left_s is None else self._api.clock.steady_s() + left_s,
+            detail=detail,
+            differs=differs(body, session, _COMPARED),
+        )
 
 
 TARGET = CamaraTarget

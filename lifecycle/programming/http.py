@@ -11,7 +11,6 @@ from __future__ import annotations
 import email.utils
 import os
 import re
-import zlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 from urllib.parse import quote, unquote, urlsplit
@@ -29,25 +28,17 @@ try:
 except ModuleNotFoundError:  # an extra: most systems program no network that is reached over HTTP
     httpx = None  # type: ignore[assignment]
 
-MERGE_PATCH = "application/merge-patch+json"
-"""RFC 7396; what TS 29.122 wants of PATCH."""
-
 ID_PATTERN = r"^[!-~]{1,512}$"
 """The id of a subscription or a session; CAMARA's are UUIDs."""
 
-_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE", "PATCH"})
-"""RFC 9110 §9.2.2, and PATCH: a merge patch that is applied twice gives the same."""
+_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE"})
+"""RFC 9110 §9.2.2."""
 
 _ALWAYS_AGAIN = frozenset({409, 429, 503})
 _PASSING = frozenset({500, 502, 504})
 _MAX_QUOTED = 300
 _LARGEST_ANSWER = 4 * 1024 * 1024
-"""Bytes, unpacked: answers are a session or a subscription each, and a list of them all when one
-was lost."""
-
-_PACKED = {"gzip": 31, "x-gzip": 31, "deflate": 15}
-"""Content codings that are unpacked, though none is asked for, with zlib's name for each
-(RFC 9110 §8.4.1): one at most, as each multiplies the size by up to a thousand."""
+"""Bytes: answers are a session or a subscription each, and a list of them all when one was lost."""
 
 _T = TypeVar("_T")
 
@@ -205,7 +196,6 @@ class Api:
         path: str,
         body: Mapping[str, object] | None = None,
         *,
-        content_type: str = "application/json",
         may_be_gone: bool = False,
     ) -> Reply:
         """Ask, and ask again where that is right; always back by the deadline.
@@ -218,7 +208,6 @@ class Api:
             method: HTTP method.
             path: below `url`; starts with a slash.
             body: sent as JSON.
-            content_type: of the body.
             may_be_gone: 404 and 410 are answers, not errors.
 
         Raises:
@@ -230,7 +219,7 @@ class Api:
             "accept-encoding": "identity",
         }
         if body is not None:
-            headers["content-type"] = content_type
+            headers["content-type"] = "application/json"
         content = None if body is None else to_json(body)
         request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
         wait_s = self._patience.first_s
@@ -305,21 +294,17 @@ class Api:
         """Send a request and read its answer, of which no more than can be of use.
 
         Raises:
-            httpx.HTTPError: there is none.
-            zlib.error: it is not packed as it says.
+            httpx.HTTPError: there is none, or it is packed.
         """
         body = bytearray()
         async with self._client() as client:
             answer = await client.send(request, stream=True)
             try:
-                coding = answer.headers.get("content-encoding", "identity").strip().lower()
-                if coding not in ("", "identity", *_PACKED):
-                    raise httpx.DecodingError(f"packed as {coding!r}")
-                unpacking = zlib.decompressobj(_PACKED[coding]) if coding in _PACKED else None
-                # Not aiter_bytes, which unpacks all that arrives at once: 64 kB may be 64 MB.
+                coding = answer.headers.get("content-encoding", "identity")
+                if coding.strip().lower() not in ("", "identity"):
+                    raise httpx.RemoteProtocolError(f"packed as {coding!r}, unasked")
                 async for chunk in answer.aiter_raw():
-                    left = _LARGEST_ANSWER + 1 - len(body)
-                    body += unpacking.decompress(chunk, left) if unpacking else chunk
+                    body += chunk
                     if len(body) > _LARGEST_ANSWER:
                         break
             finally:

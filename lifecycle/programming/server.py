@@ -11,18 +11,20 @@ from __future__ import annotations
 import abc
 import ipaddress
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
+from msgspec import to_builtins
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.programming.http import Api, as_segment
+from lifecycle.programming.http import Api, as_segment, text_of
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks
+from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
 from lifecycle.programming.settings import ServerSettings, device_networks, load_settings
 from lifecycle.programming.target import (
     ChangeKind,
@@ -133,7 +135,7 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         id: what the server calls it.
-        expires_s: seconds since the epoch; None if it does not expire.
+        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
         detail: for people: "granted for 600 s instead of 3600 s".
         differs: why it is not what was asked for; empty if it is.
     """
@@ -238,21 +240,19 @@ class ServerTarget(Target):
         cls, rules: Iterable[FlowRule], server: Any
     ) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
         """Return one request per flow and device, and the flows that none can be made for."""
-        wanted: list[Wanted] = []
-        left: list[str] = []
-        for rule in rules:
-            try:
-                wanted += [
-                    Wanted(
-                        key=f"{rule.key} {'from' if end.sends else 'to'} device",
-                        rule=rule,
-                        body=cls.body(rule, end, server),
-                    )
-                    for end in device_ends(rule, server.devices)
-                ]
-            except ValueError as error:  # noqa: PERF203 - the other flows are asked for
-                left += rule.left_out(str(error))
-        return tuple(wanted), tuple(left)
+
+        def make(rule: FlowRule) -> list[Wanted]:
+            return [
+                Wanted(
+                    key=f"{rule.key} {'from' if end.sends else 'to'} device",
+                    rule=rule,
+                    body=cls.body(rule, end, server),
+                )
+                for end in device_ends(rule, server.devices)
+            ]
+
+        made, left_out = expressed(rules, make)
+        return tuple(each for _, of in made for each in of), left_out
 
     @staticmethod
     @abc.abstractmethod
@@ -275,9 +275,10 @@ class ServerTarget(Target):
     def see(self, id_: str, body: Body) -> Made | None:
         """Look at one, and compare it with what was asked for; None if it is gone."""
 
-    @abc.abstractmethod
-    def update(self, id_: str, before: Body, body: Body) -> Made:
-        """Change one; the id may become another."""
+    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - may be compared
+        """Change one; here by a new one, after the old, as two for one flow may be a conflict."""
+        self.delete(id_)
+        return self.create(body)
 
     def delete(self, id_: str) -> None:
         """Delete one; that it is gone already is no error."""
@@ -336,7 +337,7 @@ class ServerTarget(Target):
         seen = self.see(entry.id, asked)
         if seen is None:
             return ChangeKind.CREATE, "gone from the server"
-        if seen.expires_s != entry.expires_s:
+        if (seen.expires_s or math.inf) < (entry.expires_s or math.inf) - 1:
             self._note(replace(entry, expires_s=seen.expires_s))
         if asked != body:
             return ChangeKind.UPDATE, ""
@@ -411,6 +412,24 @@ class ServerTarget(Target):
             self._ledger.put(replace(self._record, entries=every))
         else:
             self._ledger.drop(self._record)
+
+
+def differs(
+    asked: Mapping[str, Any], seen: msgspec.Struct, keys: Iterable[str], *, missing: bool = False
+) -> str:
+    """Return why what a server shows is not what was asked for; empty if it is.
+
+    Args:
+        asked: our body.
+        seen: the server's, which leaves out what is not shown; it may add to ours.
+        keys: that are compared.
+        missing: something that the server does not show differs too.
+    """
+    shown = to_builtins(seen)
+    for key in keys:
+        if (missing or key in shown) and shown.get(key) != asked.get(key):
+            return f"the server has {key} {text_of(str(shown.get(key)))!r}"
+    return ""
 
 
 def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
