@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +17,6 @@ from pathlib import Path
 import msgspec
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import UsageError
 from lifecycle.programming.target import ProgrammingError
 from lifecycle.run_directory import (
     LEDGER_LOCK_NAME,
@@ -26,6 +24,7 @@ from lifecycle.run_directory import (
     ChildRecord,
     boot_id,
     is_process,
+    private_directory,
     start_ticks,
 )
 
@@ -116,16 +115,18 @@ class Ledger:
 
         Raises:
             ProgrammingError: another process keeps it for too long.
+        UsageError: others can write where it is kept.
         """
+        # What others can write would make us delete what is not ours.
         for each in (self._directory.parent, self._directory):
-            _own_directory(each)
-        lock = os.open(
-            self._directory / LEDGER_LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
-        )
-        try:
-            deadline = time.monotonic() + _LOCK_S
-            while not _locks(lock):
-                if time.monotonic() > deadline:
+            private_directory(each)
+        with (self._directory / LEDGER_LOCK_NAME).open("w") as lock:
+            until_s = time.monotonic() + _LOCK_S
+            while True:
+                with contextlib.suppress(BlockingIOError):
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                if time.monotonic() > until_s:
                     raise ProgrammingError(
                         f"cannot program the flows of {self.system!r}: another process has been "
                         f"doing so for {_LOCK_S:g} s",
@@ -133,8 +134,6 @@ class Ledger:
                     )
                 time.sleep(_LOCK_CHECK_S)
             yield
-        finally:
-            os.close(lock)
 
     def read(self) -> LedgerFile:
         """Return what is written.
@@ -208,24 +207,3 @@ def owner_is_dead(file: LedgerFile) -> bool:
     if file.owner is None:
         return False
     return file.boot_id != boot_id() or not is_process(file.owner.pid, file.owner.start_ticks)
-
-
-def _own_directory(path: Path) -> None:
-    """Make `path` if need be; what others can write would make us delete what is not ours."""
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    status = path.lstat()
-    others = stat.S_IWGRP | stat.S_IWOTH
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & others:
-        raise UsageError(
-            f"cannot keep a ledger in {str(path)!r}: it must be a directory of this user that "
-            "others cannot write",
-            hint="remove it, or set XDG_RUNTIME_DIR",
-        )
-
-
-def _locks(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

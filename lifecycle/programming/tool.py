@@ -41,12 +41,8 @@ _NO_FEATURE = re.compile(
 )
 
 
-class ToolOutput(msgspec.Struct, frozen=True, kw_only=True):
-    """What a program left."""
-
-    returncode: int
-    stdout: str
-    stderr: str
+Output = subprocess.CompletedProcess[str]
+"""What a program left."""
 
 
 class HostTool:
@@ -59,7 +55,7 @@ class HostTool:
     def __init__(self, prefix: Sequence[str] = ()) -> None:
         self._prefix = tuple(prefix)
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         """Run a program to its end and return what it left, whatever its exit code.
 
         Raises:
@@ -70,7 +66,7 @@ class HostTool:
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         try:
             with OWN_CHILD:
-                done = subprocess.run(
+                return subprocess.run(
                     [*self._prefix, *argv],
                     input=stdin,
                     capture_output=True,
@@ -93,7 +89,6 @@ class HostTool:
             ) from error
         except OSError as error:
             raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
-        return ToolOutput(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
 
 
 def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
@@ -147,10 +142,11 @@ def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
         ) from error
 
 
-def failure(output: ToolOutput, argv: Sequence[str], *, doing: str) -> ProgrammingError:
+def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
     """Return the error that a failed program means."""
     command = shlex.join(argv)
-    said = _first_line(output.stderr) or f"exit code {output.returncode}"
+    printed = filter(None, map(str.strip, output.stderr.splitlines()))
+    said = next(printed, f"exit code {output.returncode}")
     if _NO_PRIVILEGE.search(output.stderr):
         return PrivilegeError(
             f"cannot {doing}: {command!r} needs CAP_NET_ADMIN in this network namespace",
@@ -159,7 +155,3 @@ def failure(output: ToolOutput, argv: Sequence[str], *, doing: str) -> Programmi
     if _NO_FEATURE.search(output.stderr):
         return MissingFeatureError(f"cannot {doing}: {command!r} says {said!r}")
     return ProgrammingError(f"cannot {doing}: {command!r} says {said!r}")
-
-
-def _first_line(text: str) -> str:
-    return next((line.strip() for line in text.splitlines() if line.strip()), "")

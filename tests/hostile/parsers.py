@@ -28,13 +28,13 @@ from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget, root_qdiscs
 from lifecycle.programming.settings import load_settings
 from lifecycle.programming.target import Means, ProgrammingError
-from lifecycle.programming.tool import HostTool, ToolOutput
+from lifecycle.programming.tool import HostTool
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer
 from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
-from tests.unit.programming.fakes import FakeTool, failed
+from tests.unit.programming.fakes import FakeTool, failed, printed
 from tests.unit.programming.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
@@ -85,11 +85,11 @@ def _ledger(path: Path) -> object:
 
 
 def _qdiscs(data: bytes, _: Path) -> object:
-    return root_qdiscs(FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr=""))))
+    return root_qdiscs(FakeTool(("tc", printed(_text(data)))))
 
 
 def _nft(data: bytes, folder: Path) -> object:
-    tool = FakeTool(("nft", ToolOutput(returncode=0, stdout=_text(data), stderr="")))
+    tool = FakeTool(("nft", printed(_text(data))))
     return NftTarget(None, Means(Ledger(folder, "robot")), tool).plan([])
 
 
@@ -102,7 +102,7 @@ def _tc(data: bytes, folder: Path) -> object:
     from lifecycle.programming.tc import TcSettings, TcTarget
 
     tool = FakeTool(
-        ("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")),
+        ("tc", printed(_text(data))),
         ("nft -s list", failed("Error: No such file or directory")),
     )
     settings = TcSettings(device="eth0", link_kbit=20_000)

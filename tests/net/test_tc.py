@@ -22,7 +22,7 @@ from lifecycle.programming.target import (
     TargetChanges,
 )
 from lifecycle.programming.tc import TcSettings, TcTarget
-from lifecycle.programming.tool import HostTool, ToolOutput
+from lifecycle.programming.tool import HostTool, Output
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
 
@@ -283,7 +283,7 @@ class StopsAt:
         self._tool = HostTool(host.command())
         self._line = line
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         broken = stdin.replace(self._line, f"{self._line} nonsense", 1)
         return self._tool.run(argv, stdin=broken)
 

@@ -20,8 +20,8 @@ from lifecycle.programming.target import (
     TargetChanges,
 )
 from lifecycle.programming.tc import parse_queue, parse_rate
-from lifecycle.programming.tool import HostTool, ToolOutput, demand
-from tests.unit.programming.fakes import FakeTool, failed
+from lifecycle.programming.tool import HostTool, Output, demand
+from tests.unit.programming.fakes import FakeTool, failed, printed
 from tests.unit.programming.samples import ledger_in, rule
 
 NO_TABLE = failed("Error: No such file or directory\nlist table inet flowqos_robot\n")
@@ -87,7 +87,7 @@ def test_programs_read_stdin_and_speak_english() -> None:
 
 
 def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> None:
-    listed = ToolOutput(returncode=0, stdout=json.dumps(QDISCS), stderr="")
+    listed = printed(json.dumps(QDISCS))
     tool = FakeTool(("nft -s list", NO_TABLE), ("tc -j qdisc show", listed))
 
     changes = NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()])
@@ -105,7 +105,7 @@ def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> N
 
 
 def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> None:
-    def missing() -> ToolOutput:
+    def missing() -> Output:
         raise MissingFeatureError("cannot run 'tc'")
 
     tool = FakeTool(("nft -s list", NO_TABLE), ("tc", missing))
