@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import math
 import re
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import LifecycleError
 from lifecycle.programming.http import ID_PATTERN, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
@@ -27,7 +27,7 @@ from lifecycle.programming.server import (
     differs,
 )
 from lifecycle.programming.settings import ServerSettings
-from lifecycle.programming.target import HttpError, PartlyError
+from lifecycle.programming.target import HttpError, PartlyError, each_done
 
 _COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
 
@@ -52,20 +52,18 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
     Attributes:
         url: everything before `/sessions`.
         qos_profiles: the provider's names of profiles, by 5QI.
-        default_qos_profile: for flows whose 5QI is not named; empty leaves them out.
         duration_s: 1–2147483647; sessions are renewed, or they expire.
         device_by_token: the access token names the device (three-legged), so that the body must
             not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
     """
 
     qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
-    default_qos_profile: str = ""
     duration_s: int = 3600
     device_by_token: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for profile in filter(None, (*self.qos_profiles.values(), self.default_qos_profile)):
+        for profile in self.qos_profiles.values():
             if not re.fullmatch(r"[a-zA-Z0-9_.-]{3,256}", profile):
                 raise ValueError(
                     f"cannot use qosProfile {profile!r}; "
@@ -108,9 +106,7 @@ class CamaraTarget(ServerTarget):
         It has no protocol and no direction: it treats what goes between a device's ports and a
         server's ports, both ways, UDP and TCP alike.
         """
-        profile = class_name(
-            rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
-        )
+        profile = class_name(rule, settings.qos_profiles, setting="qos_profiles")
         address = {"publicAddress": end.device, "privateAddress": end.device}
         device: Body = {"ipv4Address": address}
         if end.is_ipv6:
@@ -166,21 +162,17 @@ class CamaraTarget(ServerTarget):
         Raises:
             PartlyError: something could not be prolonged and will expire or has expired.
         """
-        errors: list[tuple[str, LifecycleError]] = []
-        for entry in self._entries().values():
-            due_s = self._due_in_s(entry)
-            if not entry.id or due_s is None or due_s > 0:
-                continue
-            try:
-                made = self._prolonged(entry, json.loads(entry.body))
-            except LifecycleError as error:
-                errors.append((entry.key, error))
-            else:
-                self._note(replace(entry, id=made.id, expires_s=made.expires_s))
-        if errors:
+        now = [each for each in self._entries().values() if each.id and self._due_in_s(each) <= 0]
+        _, failed = each_done(now, self._prolong)
+        if failed:
+            errors = [(entry.key, error) for entry, error in failed]
             raise PartlyError(self.name, len(self._entries()), errors)
-        due = [self._due_in_s(each) for each in self._entries().values()]
-        return min((each for each in due if each is not None), default=None)
+        due_s = min(map(self._due_in_s, self._entries().values()), default=math.inf)
+        return None if due_s == math.inf else due_s
+
+    def _prolong(self, entry: Entry) -> None:
+        made = self._prolonged(entry, json.loads(entry.body))
+        self._note(replace(entry, id=made.id, expires_s=made.expires_s))
 
     def _prolonged(self, entry: Entry, body: Body) -> Made:
         """Extend a session; make a new one where it cannot be extended any further."""
@@ -202,10 +194,10 @@ class CamaraTarget(ServerTarget):
                     return made
         return self.update(entry.id, body, body)
 
-    def _due_in_s(self, entry: Entry) -> float | None:
+    def _due_in_s(self, entry: Entry) -> float:
         """Return seconds until a session must be prolonged; negative once it is late."""
         if entry.expires_s is None:
-            return None
+            return math.inf
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
         return entry.expires_s - self._api.clock.steady_s() - margin_s

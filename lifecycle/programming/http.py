@@ -222,44 +222,33 @@ class Api:
             headers["content-type"] = "application/json"
         content = None if body is None else to_json(body)
         request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
-        wait_s = self._patience.first_s
+        wait_s, attempt = self._patience.first_s, 1
         with self._deadline.within(self._patience.total_s):
-            for attempt in range(1, self._patience.attempts + 1):
-                asked_s = None
+            while True:
                 try:
-                    reply = self._attempt(request)
+                    return self._attempt(request, may_be_gone=may_be_gone)
                 except HttpError as error:
-                    failed, again = error, method in _IDEMPOTENT or not error.uncertain
-                else:
-                    if reply.is_success or (may_be_gone and reply.gone):
-                        return reply
-                    lost, twice = reply.status in _PASSING, method in _IDEMPOTENT
-                    failed = self._refusal(reply, uncertain=lost and not twice)
-                    again = reply.status in _ALWAYS_AGAIN or (lost and twice)
-                    asked_s = _retry_after_s(
-                        reply.headers.get("retry-after", ""), self.clock.now_s()
-                    )
-                pause_s = min(wait_s, self._patience.longest_s) if asked_s is None else asked_s
-                left_s = self._deadline.left_s()
-                if not again or attempt == self._patience.attempts:
-                    break
-                if pause_s >= left_s:
-                    # What has failed says more than that there is no time to try again.
-                    if asked_s is not None:
-                        failed.hint = (
-                            f"the server asks to wait {asked_s:g} s, more than the {left_s:.0f} s "
-                            "that this waits for; try again then"
-                        )
-                    break
+                    pause_s = min(wait_s, self._patience.longest_s)
+                    pause_s = pause_s if error.after_s is None else error.after_s
+                    left_s = self._deadline.left_s()
+                    if not error.again or attempt == self._patience.attempts:
+                        raise
+                    if pause_s >= left_s:
+                        # What has failed says more than that there is no time to try again.
+                        if error.after_s is not None:
+                            error.hint = (
+                                f"the server asks to wait {pause_s:g} s, more than the "
+                                f"{left_s:.0f} s that this waits for; try again then"
+                            )
+                        raise
                 self.pause(pause_s)
-                wait_s *= 2
-        raise failed
+                wait_s, attempt = wait_s * 2, attempt + 1
 
-    def _attempt(self, request: httpx.Request) -> Reply:
+    def _attempt(self, request: httpx.Request, *, may_be_gone: bool) -> Reply:
         """Ask once.
 
         Raises:
-            HttpError: there is no answer that can be read; `uncertain` if it was sent.
+            HttpError: refused, or there is no answer that can be read; says whether to ask again.
         """
         what = f"{request.method} {request.url}"
         limit_s = min(self._timeout_s, self._deadline.left_s())
@@ -277,7 +266,7 @@ class Api:
         if self._token is not None:
             request.headers["authorization"] = f"Bearer {self._token.reveal()}"
         try:
-            return self._deadline.run(self._ask(request), limit_s)
+            reply = self._deadline.run(self._ask(request), limit_s)
         except TimeoutError:
             reason = f"no {'whole answer' if sent else 'connection'} in time"
             if self._deadline.cancelled.is_set():
@@ -288,7 +277,12 @@ class Api:
         except Exception as error:  # noqa: BLE001 - whatever a library makes of unexpected bytes
             # Never its own message, which may quote the request.
             reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
-        raise HttpError(f"cannot {what}: {reason}", uncertain=sent)
+        else:
+            if reply.is_success or (may_be_gone and reply.gone):
+                return reply
+            raise self._refusal(reply, request.method)
+        again = request.method in _IDEMPOTENT or not sent
+        raise HttpError(f"cannot {what}: {reason}", uncertain=sent, again=again)
 
     async def _ask(self, request: httpx.Request) -> Reply:
         """Send a request and read its answer, of which no more than can be of use.
@@ -321,7 +315,7 @@ class Api:
         ended = self._deadline.cancelled.is_set()
         return "it was ended before it was done" if ended else "no time left"
 
-    def _refusal(self, answer: Reply, *, uncertain: bool) -> HttpError:
+    def _refusal(self, answer: Reply, method: str) -> HttpError:
         try:
             found = from_json(answer.body, _Problem, longest=_LARGEST_ANSWER)
         except ValueError:
@@ -337,11 +331,14 @@ class Api:
             first(found.cause, found.code),
             first(found.detail, found.message, found.title),
         ]
+        lost, twice = answer.status in _PASSING, method in _IDEMPOTENT
         forbidden = answer.status in (401, 403)
         return HttpError(
             f"cannot {answer.asked}: {': '.join(filter(None, words))}",
             status=answer.status,
-            uncertain=uncertain,
+            uncertain=lost and not twice,
+            again=answer.status in _ALWAYS_AGAIN or (lost and twice),
+            after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.clock.now_s()),
             hint="check the token and what it is allowed to do" if forbidden else "",
         )
 

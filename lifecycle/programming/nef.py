@@ -44,14 +44,12 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
         scs_as_id: who we are to the operator.
         notification_destination: http or https URL that the network reports to.
         qos_references: the operator's names of classes, by 5QI.
-        default_qos_reference: for flows whose 5QI is not named; empty leaves them out.
         protocol_by_name: write `udp` instead of `17`, as some servers want it.
     """
 
     scs_as_id: str
     notification_destination: str
     qos_references: dict[int, str] = msgspec.field(default_factory=dict)
-    default_qos_reference: str = ""
     protocol_by_name: bool = False
 
     def __post_init__(self) -> None:
@@ -122,9 +120,7 @@ class NefTarget(ServerTarget):
 
         One flow each: a known open implementation passes on only the last of several.
         """
-        reference = class_name(
-            rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
-        )
+        reference = class_name(rule, settings.qos_references, setting="qos_references")
         return {
             "supportedFeatures": "0",  # hexadecimal, TS 29.571: none
             "notificationDestination": settings.notification_destination,

@@ -12,7 +12,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.network.dscp import code_points, describe, dscp_name
+from lifecycle.network.dscp import describe
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.rules import FlowRule, named
 from lifecycle.programming.tables import (
@@ -30,16 +30,6 @@ from lifecycle.programming.tool import HostTool, failure, qdiscs
 
 _BAND_QDISCS = ("pfifo_fast", "prio")
 """They sort by the old TOS bits, where EF, CS6 and DF share the middle band and AF*1 the worst."""
-
-
-def nft_keyword(dscp: int) -> str:
-    """Return how nft spells a DSCP, as a keyword where nftables 1.0.6 knows one.
-
-    Raises:
-        ValueError: not 0–63.
-    """
-    name = dscp_name(dscp)
-    return next((each.nft for each in code_points() if each.name == name), name)
 
 
 class NftTarget(TableTarget):
@@ -68,7 +58,7 @@ class NftTarget(TableTarget):
         found = []
         network = network_of(rule)
         if rule.dscp is not None:
-            found.append((f"{network} dscp set {nft_keyword(rule.dscp)}", describe(rule.dscp)))
+            found.append((f"{network} dscp set {rule.dscp}", describe(rule.dscp)))
         if rule.flow_label:
             label = f"{rule.flow_label:#07x}"
             found.append((f"{network} flowlabel set {label}", f"flow label {label}"))

@@ -21,7 +21,7 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
-from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.errors import UsageError
 from lifecycle.programming.http import Api, as_segment, text_of
 from lifecycle.programming.ledger import Entry, TargetRecord
 from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
@@ -36,6 +36,7 @@ from lifecycle.programming.target import (
     Target,
     TargetChanges,
     describe_rule,
+    each_done,
 )
 
 Body = dict[str, Any]
@@ -80,13 +81,9 @@ def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]
     source = (rule.source_address, rule.source_port)
     destination = (rule.destination_address, rule.destination_port)
     networks = device_networks(devices)
+    ends = (DeviceEnd(False, *destination, *source), DeviceEnd(True, *source, *destination))
     found = tuple(
-        end
-        for name, end in (
-            ("destination", DeviceEnd(False, *destination, *source)),
-            ("source", DeviceEnd(True, *source, *destination)),
-        )
-        if name in devices or any(ipaddress.ip_address(end.device) in each for each in networks)
+        end for end in ends if any(ipaddress.ip_address(end.device) in each for each in networks)
     )
     if not found:
         text = ", ".join(map(str, networks))
@@ -94,27 +91,24 @@ def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]
     return found
 
 
-def class_name(rule: FlowRule, names: Mapping[int, str], default: str, *, setting: str) -> str:
+def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str:
     """Return what the operator calls the class that a flow asks for.
 
     Args:
         rule: of the flow.
         names: by 5QI.
-        default: for flows whose 5QI has no name or that ask for none; empty leaves them out.
         setting: name of `names` in the settings, for the message.
 
     Raises:
         ValueError: there is no name.
     """
-    if rule.five_qi is not None and rule.five_qi in names:
-        return names[rule.five_qi]
-    if default:
-        return default
     if rule.five_qi is None:
-        raise ValueError(f"it asks for no 5QI ({asks(rule)}), and there is no default class")
-    raise ValueError(
-        f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
-    )
+        raise ValueError(f"it asks for no 5QI ({asks(rule)})")
+    if rule.five_qi not in names:
+        raise ValueError(
+            f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
+        )
+    return names[rule.five_qi]
 
 
 class Wanted(msgspec.Struct, frozen=True, kw_only=True):
@@ -347,38 +341,35 @@ class ServerTarget(Target):
 
     def _carried_out(self, wanted: Sequence[Wanted]) -> TargetChanges:
         planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
-        done: list[FlowChange] = []
-        errors: list[tuple[str, LifecycleError]] = []
-        for change, body in planned:
-            try:
-                detail = self._make(change, body)
-            except LifecycleError as error:  # noqa: PERF203 - the other flows go on
-                errors.append((change.key, error))
-            else:
-                done.append(replace(change, detail=detail or change.detail))
+        done, failed = each_done(planned, self._make)
         made = TargetChanges(target=self.name, changes=tuple(done))
-        if errors:
+        if failed:
+            errors = [(change.key, error) for (change, _), error in failed]
             text = [made.render(done=True)] if made.pending else []
             raise PartlyError(self.name, len(planned), errors, done=text)
         return made
 
-    def _make(self, change: FlowChange, body: Body) -> str:
-        """Make one change; returns what is to be reported of it."""
+    def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
+        """Make one change; return it with what came of it."""
+        change, body = planned
+        if change.kind is ChangeKind.KEEP:
+            return change
         if change.kind is ChangeKind.CREATE:
-            return self._create(change, body)
+            made = self._create(change, body)
+            return replace(change, detail=made.detail or change.detail)
         entry = self._entries()[change.key]
+        asked = json.loads(entry.body)
         if change.kind is ChangeKind.UPDATE:
-            made = self.update(entry.id, json.loads(entry.body), body)
+            made = self.update(entry.id, asked, body)
             self._note(_entry(change, body, made))
-            return made.detail
-        if change.kind is ChangeKind.DELETE:
-            found = Made(id=entry.id) if entry.id else self.find(json.loads(entry.body))
-            if found is not None:
-                self.delete(found.id)
-            self._forget(change.key)
-        return ""
+            return replace(change, detail=made.detail or change.detail)
+        found = Made(id=entry.id) if entry.id else self.find(asked)
+        if found is not None:
+            self.delete(found.id)
+        self._forget(change.key)
+        return change
 
-    def _create(self, change: FlowChange, body: Body) -> str:
+    def _create(self, change: FlowChange, body: Body) -> Made:
         self._note(_entry(change, body, None))
         try:
             made = self.create(body)
@@ -395,7 +386,7 @@ class ServerTarget(Target):
                 raise
             made = found
         self._note(_entry(change, body, made))
-        return made.detail
+        return made
 
     def _entries(self) -> dict[str, Entry]:
         """What is ours there, by key."""

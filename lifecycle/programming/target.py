@@ -10,8 +10,8 @@ from __future__ import annotations
 import abc
 import enum
 import importlib
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -21,6 +21,9 @@ from lifecycle.programming.rules import FlowRule, RuleSet, asks
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 TARGETS = ("nft", "tc", "nef", "camara")
 
@@ -255,6 +258,20 @@ def _either(words: Sequence[str]) -> str:
     return f"{', '.join(most)} or {last}" if most else last
 
 
+def each_done(
+    things: Iterable[T], do: Callable[[T], R]
+) -> tuple[list[R], list[tuple[T, LifecycleError]]]:
+    """Do it to each, whatever becomes of the others; return what was done, and what failed."""
+    done: list[R] = []
+    failed: list[tuple[T, LifecycleError]] = []
+    for each in things:
+        try:
+            done.append(do(each))
+        except LifecycleError as error:  # noqa: PERF203 - the others go on
+            failed.append((each, error))
+    return done, failed
+
+
 def describe_rule(rule: FlowRule) -> str:
     """Return a rule for people: the tuple and what it gets."""
     return f"{rule.describe()}, {asks(rule)}"
@@ -288,14 +305,25 @@ class HttpError(ProgrammingError):
     Attributes:
         status: HTTP status; 0 if there was no answer.
         uncertain: the request may have taken effect all the same.
+        again: it may be asked again.
+        after_s: how long the server asks to wait before that; None if it does not say.
     """
 
     def __init__(
-        self, message: str, *, status: int = 0, uncertain: bool = False, hint: str = ""
+        self,
+        message: str,
+        *,
+        status: int = 0,
+        uncertain: bool = False,
+        again: bool = False,
+        after_s: float | None = None,
+        hint: str = "",
     ) -> None:
         super().__init__(message, hint=hint)
         self.status = status
         self.uncertain = uncertain
+        self.again = again
+        self.after_s = after_s
 
 
 class PartlyError(ProgrammingError):

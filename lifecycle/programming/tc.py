@@ -29,7 +29,6 @@ from lifecycle.errors import UsageError
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.nft import nft_keyword
 from lifecycle.programming.rules import FlowRule, named
 from lifecycle.programming.tables import (
     Placed,
@@ -360,7 +359,7 @@ class TcTarget(TableTarget):
         if settings.match is TcMatch.MARK:
             if rule.dscp is None:
                 raise ValueError("it has no DSCP, and rules look at nothing else here")
-            matches = [f"{each} dscp {nft_keyword(rule.dscp)}" for each in ("ip", "ip6")]
+            matches = [f"{each} dscp {rule.dscp}" for each in ("ip", "ip6")]
             comment = class_.comment
         statement = f"meta priority set {OWNED_HANDLE}{class_.minor:x}"
         out = f'oifname "{settings.device}"'

@@ -19,9 +19,9 @@ from lifecycle.programming.ledger import (
 )
 from lifecycle.programming.programmer import (
     Programmer,
-    RouteSources,
     removal_of,
     route_source,
+    route_sources,
     sweep_orphans,
 )
 from lifecycle.programming.rules import flow_rules
@@ -153,7 +153,7 @@ def test_what_no_target_took_is_not_held(tmp_path: Path) -> None:
 def test_what_a_server_took_a_part_of_is_held(tmp_path: Path) -> None:
     targets = Means(ledger_in(tmp_path))
     with NefServer() as server:
-        settings = nef_settings(server.url, devices=["source", "destination"])
+        settings = nef_settings(server.url, devices=["0.0.0.0/0"])
         options = read_targets(["nef"], {"config": settings_file(tmp_path, nef=settings)})[0]
         programs = Programmer(plan(), [options.open(targets)], targets)
         server.failures.append(("POST", Answer(status=400)))
@@ -212,7 +212,7 @@ def test_all_failures_are_told_together(tmp_path: Path) -> None:
 
 def test_the_source_address_is_what_this_host_sends_from_where_it_is_the_publishers() -> None:
     here = plan(robot="127.0.0.1")
-    sources = RouteSources(here)
+    sources = route_sources(here)
     camera, viewer = here.nodes
 
     assert sources(camera, "127.0.0.9") == "127.0.0.9"
@@ -221,7 +221,7 @@ def test_the_source_address_is_what_this_host_sends_from_where_it_is_the_publish
     (found,) = flow_rules(
         [report(destination=(nfe("127.0.0.9", 7001),))],
         plan(robot="", operator=""),
-        source_address=RouteSources(plan(robot="", operator="")),
+        source_address=route_sources(plan(robot="", operator="")),
     ).rules
     assert found.describe() == "udp 127.0.0.9:45000 → 127.0.0.9:7001"
 

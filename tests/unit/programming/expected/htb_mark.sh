@@ -34,10 +34,10 @@ table inet flowtc_eth0_teleop {
   comment "managed-by=lifecycle"
   chain post {
     type filter hook postrouting priority -149; policy accept;
-    oifname "eth0" ip dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
-    oifname "eth0" ip6 dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
-    oifname "eth0" ip dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
-    oifname "eth0" ip6 dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip dscp 46 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+    oifname "eth0" ip6 dscp 46 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+    oifname "eth0" ip dscp 1 meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip6 dscp 1 meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
     oifname "eth0" ip dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
     oifname "eth0" ip6 dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
     oifname "eth0" ip dscp 45 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
