@@ -28,8 +28,10 @@ from lifecycle.programming.tables import (
 from lifecycle.programming.target import Means, PrivilegeError, ProgrammingError, TargetChanges
 from lifecycle.programming.tool import HostTool, failure, qdiscs
 
-_BAND_QDISCS = ("pfifo_fast", "prio")
-"""They sort by the old TOS bits, where EF, CS6 and DF share the middle band and AF*1 the worst."""
+_BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
+_BLIND = "does not look at DSCP"
+_WITHOUT_PRIORITY = {"pfifo_fast": _BANDS, "prio": _BANDS, "pfifo": _BLIND, "fq_codel": _BLIND}
+"""What queueing disciplines do with marks; two sort by the old TOS bits."""
 
 
 class NftTarget(TableTarget):
@@ -115,28 +117,17 @@ class NftTarget(TableTarget):
         return f"# Not checked: this kernel allows no user namespaces.\n{text}"
 
     def _warnings(self) -> tuple[str, ...]:
+        try:
+            found = qdiscs(self._tool, doing="list queueing disciplines")
+        except ProgrammingError:
+            return ()
         return tuple(
-            f"marking alone gives no priority on {device}: its queueing discipline {kind} "
-            f"{_effect(kind)}; add one that looks at these flows: "
-            f"lifecycle flows apply MANIFEST --target tc --device {device} --rate RATE"
-            for device, kind in root_qdiscs(self._tool)
-            if device != "lo" and kind in (*_BAND_QDISCS, "pfifo", "fq_codel")
+            f"marking alone gives no priority on {each.dev}: its queueing discipline {each.kind} "
+            f"{_WITHOUT_PRIORITY[each.kind]}; add one that looks at these flows: "
+            f"lifecycle flows apply MANIFEST --target tc --device {each.dev} --rate RATE"
+            for each in found
+            if each.root and each.dev != "lo" and each.kind in _WITHOUT_PRIORITY
         )
-
-
-def root_qdiscs(tool: HostTool) -> tuple[tuple[str, str], ...]:
-    """Return (device, kind) of every root queueing discipline; empty where tc fails."""
-    try:
-        found = qdiscs(tool, doing="list queueing disciplines")
-    except ProgrammingError:
-        return ()
-    return tuple((each.dev, each.kind) for each in found if each.root)
-
-
-def _effect(kind: str) -> str:
-    if kind in _BAND_QDISCS:
-        return "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
-    return "does not look at DSCP"
 
 
 TARGET = NftTarget

@@ -14,15 +14,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-import msgspec
 import psutil
 
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
+from lifecycle.network.five_qi import dscp_mapping, parse_mapping
 from lifecycle.network.nfe import canonical, is_loopback
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
-from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, flow_rules
+from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, Treatment, flow_rules
 from lifecycle.programming.target import (
     Chosen,
     Means,
@@ -39,18 +38,6 @@ from lifecycle.verify.verdict import FlowReport
 
 _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""
-
-
-class Treatment(msgspec.Struct, frozen=True, kw_only=True):
-    """What flows get beyond what the manifest says.
-
-    Attributes:
-        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
-        label_flows: each IPv6 flow gets a flow label of its own.
-    """
-
-    mapping: DscpMapping | None = None
-    label_flows: bool = False
 
 
 def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
@@ -197,8 +184,7 @@ class Programmer(Removal):
             flows,
             self._plan,
             source_address=self._source_address,
-            mapping=self._treatment.mapping,
-            label_flows=self._treatment.label_flows,
+            treatment=self._treatment,
         )
         self.left_out = found.left_out
         return found

@@ -164,13 +164,25 @@ class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
     left_out: tuple[str, ...] = ()
 
 
+class Treatment(msgspec.Struct, frozen=True, kw_only=True):
+    """What flows get beyond what the manifest says.
+
+    Attributes:
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
+        label_flows: each IPv6 flow gets a flow label of its own, so that the 3-tuple of addresses
+            and label distinguishes it from others too.
+    """
+
+    mapping: DscpMapping | None = None
+    label_flows: bool = False
+
+
 def flow_rules(
     flows: Iterable[FlowReport],
     plan: Plan,
     *,
     source_address: SourceAddress | None = None,
-    mapping: DscpMapping | None = None,
-    label_flows: bool = False,
+    treatment: Treatment | None = None,
 ) -> RuleSet:
     """Turn verified flows into rules.
 
@@ -186,9 +198,7 @@ def flow_rules(
         flows: as `verify` reports them.
         plan: that they were judged against.
         source_address: see SourceAddress; None if nothing was observed.
-        mapping: gives the DSCP of flows that have a 5QI and no DSCP.
-        label_flows: give each IPv6 flow a flow label of its own, so that the 3-tuple of addresses
-            and label distinguishes it from others too.
+        treatment: what flows get beyond what the manifest says.
     """
     left_out: list[str] = []
     by_tuple: dict[str, list[FlowRule]] = {}
@@ -204,7 +214,7 @@ def flow_rules(
         elif len(asked) > 1:
             left_out += _disagreement(sharing)
         else:
-            rules.append(_treated(_merged(sharing), mapping, label_flows=label_flows))
+            rules.append(_treated(_merged(sharing), treatment or Treatment()))
     return RuleSet(rules=_distinct(rules), left_out=tuple(dict.fromkeys(left_out)))
 
 
@@ -308,11 +318,12 @@ def _merged(sharing: Sequence[FlowRule]) -> FlowRule:
     return replace(first, names=tuple(names), max_delay_ms=min(delays, default=None))
 
 
-def _treated(rule: FlowRule, mapping: DscpMapping | None, *, label_flows: bool) -> FlowRule:
+def _treated(rule: FlowRule, treatment: Treatment) -> FlowRule:
     """The rule with what follows from its 5QI and its 5-tuple."""
+    mapping, is_ipv6 = treatment.mapping, rule.internet_protocol is InternetProtocol.IPV6
     if mapping is not None and rule.dscp is None and rule.five_qi is not None:
         rule = replace(rule, dscp=mapping.dscp_for(rule.five_qi))
-    if label_flows and rule.internet_protocol is InternetProtocol.IPV6 and not rule.flow_label:
+    if treatment.label_flows and is_ipv6 and not rule.flow_label:
         # Equal for equal 5-tuples and evenly spread, as RFC 6437 §3 asks; never 0, which is none.
         digest = hashlib.sha256(rule.describe().encode()).digest()
         label = 1 + int.from_bytes(digest[:8], "big") % MAX_FLOW_LABEL

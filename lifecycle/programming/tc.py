@@ -74,9 +74,8 @@ _QUANTUM_BYTES = 3028
 _LONGEST_QUEUE_MS = 10_000
 _DEVICE = re.compile(r"[^\s/:#\"*]{1,15}")
 _NO_DEVICE = re.compile(r"cannot find device", re.IGNORECASE)
-_RATE = re.compile(r"([0-9]{1,9})(bit|kbit|mbit|gbit)")
+_QUANTITY = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,3})?)([a-z]+)")
 _KBIT = {"bit": 0.001, "kbit": 1, "mbit": 1000, "gbit": 1_000_000}
-_DURATION = re.compile(r"([0-9]{1,6}(?:\.[0-9]{1,3})?)(us|ms|s)")
 _MS = {"us": 0.001, "ms": 1.0, "s": 1000.0}
 
 
@@ -129,8 +128,7 @@ def parse_rate(text: str) -> int:
     Raises:
         ValueError: not such a rate, or below 1 kbit/s.
     """
-    match = _RATE.fullmatch(text.strip().lower())
-    kbit = int(int(match[1]) * _KBIT[match[2]]) if match else 0
+    kbit = int(_quantity(text, _KBIT))
     if kbit < 1:
         raise ValueError(f"cannot use rate {text!r}; use a number and kbit, mbit or gbit: 20mbit")
     return kbit
@@ -142,11 +140,16 @@ def parse_queue(text: str) -> float:
     Raises:
         ValueError: not such a time, or zero.
     """
-    match = _DURATION.fullmatch(text.strip().lower())
-    queue_ms = float(match[1]) * _MS[match[2]] if match else 0.0
+    queue_ms = _quantity(text, _MS)
     if queue_ms <= 0:
         raise ValueError(f"cannot use queue {text!r}; use a number and us, ms or s: 50ms")
     return queue_ms
+
+
+def _quantity(text: str, units: Mapping[str, float]) -> float:
+    """A number with a unit behind it; 0 if it is no such thing."""
+    match = _QUANTITY.fullmatch(text.strip().lower())
+    return float(match[1]) * units.get(match[2], 0.0) if match else 0.0
 
 
 class TrafficClass(msgspec.Struct, frozen=True, kw_only=True, order=True):

@@ -25,10 +25,10 @@ from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
 from lifecycle.programming.ledger import Ledger
-from lifecycle.programming.nft import NftTarget, root_qdiscs
+from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.settings import load_settings
 from lifecycle.programming.target import Means, ProgrammingError
-from lifecycle.programming.tool import HostTool
+from lifecycle.programming.tool import HostTool, qdiscs
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer
 from lifecycle.supervisor.core.state import Order
@@ -85,7 +85,7 @@ def _ledger(path: Path) -> object:
 
 
 def _qdiscs(data: bytes, _: Path) -> object:
-    return root_qdiscs(FakeTool(("tc", printed(_text(data)))))
+    return qdiscs(FakeTool(("tc", printed(_text(data)))), doing="list qdiscs")
 
 
 def _nft(data: bytes, folder: Path) -> object:

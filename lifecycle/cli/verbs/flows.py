@@ -52,7 +52,8 @@ from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.programming.programmer import Programmer, Treatment
+    from lifecycle.programming.programmer import Programmer
+    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen, TargetChanges
     from lifecycle.verify.verdict import Verdict
 
