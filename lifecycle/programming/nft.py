@@ -25,8 +25,8 @@ from lifecycle.programming.tables import (
     render_table,
     table_name,
 )
-from lifecycle.programming.target import Means, PrivilegeError, ProgrammingError, TargetChanges
-from lifecycle.programming.tool import HostTool, failure, qdiscs
+from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
+from lifecycle.programming.tool import HostTool, qdiscs
 
 _BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
 _BLIND = "does not look at DSCP"
@@ -95,26 +95,6 @@ class NftTarget(TableTarget):
         """Compare, and warn where marks change nothing."""
         planned = super().plan(rules)
         return replace(planned, warnings=self._warnings() if planned.pending else ())
-
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return the ruleset, checked by nft itself.
-
-        Where this user may not even check, nft is asked in a user namespace of its own. A kernel
-        that allows neither leaves the text unchecked, which is said in its first line.
-
-        Raises:
-            ProgrammingError: nft refuses the ruleset.
-        """
-        text = super().dry_run(rules)
-        check = ("nft", "-c", "-f", "-")
-        for argv in (check, ("unshare", "-Urn", *check)):
-            output = self._tool.run(argv, stdin=text)
-            if output.returncode == 0:
-                return text
-            error = failure(output, argv, doing=f"check {self.name}")
-            if not isinstance(error, PrivilegeError):
-                raise error
-        return f"# Not checked: this kernel allows no user namespaces.\n{text}"
 
     def _warnings(self) -> tuple[str, ...]:
         try:

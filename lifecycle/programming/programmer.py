@@ -196,7 +196,7 @@ class Programmer(Removal):
             return tuple(each.plan(rules) for each in self._targets)
 
     def dry_run(self, flows: Iterable[FlowReport]) -> str:
-        """Return what `update` would send if nothing were there, checked where that is possible."""
+        """Return what `update` would send if nothing were there."""
         rules = self.rules(flows).rules
         return "\n".join(each.dry_run(rules) for each in self._targets)
 

@@ -196,7 +196,7 @@ class Target(abc.ABC):
         """Delete everything of ours."""
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return what would be sent, checked as far as that is possible; changes nothing."""
+        """Return what would be sent if nothing were there; changes nothing."""
         return self.export(self._settings, RuleSet(rules=tuple(rules)), self._ledger.system)
 
     def renew(self) -> float | None:

@@ -415,10 +415,6 @@ class TcTarget(TableTarget):
             self._batch(render_tc_removal(self._device))
         return super().clear() or ours
 
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return the lines for tc and nft; tc itself has no dry run to check them."""
-        return f"# Not checked: tc has no dry run.\n{super().dry_run(rules)}"
-
     def _root(self) -> Qdisc | None:
         """The device's root qdisc; None if there is no such device."""
         try:

@@ -1,4 +1,4 @@
-"""Runs nft, tc and unshare: bounded, asked in English, each refusal as one sentence.
+"""Runs nft and tc: bounded, asked in English, each refusal as one sentence.
 
 Owns: what their refusals mean: a missing program, a missing privilege, a missing kernel feature;
 and the qdiscs that tc lists.
@@ -25,7 +25,7 @@ from lifecycle.run_directory import OWN_CHILD
 _TIMEOUT_S = 10.0
 """They talk to the kernel only; a busy machine needs tenths of a second."""
 
-_PACKAGES = {"nft": "nftables", "tc": "iproute2", "ip": "iproute2", "unshare": "util-linux"}
+_PACKAGES = {"nft": "nftables", "tc": "iproute2"}
 
 HOW_PRIVILEGED = (
     "run this command as root, or give it that capability: in a container --cap-add NET_ADMIN, in "

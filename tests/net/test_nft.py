@@ -174,27 +174,21 @@ def test_no_flow_to_mark_means_no_table(bench: Bench) -> None:
     assert bench.tables() == []
 
 
-def test_a_dry_run_is_checked_by_nft_and_writes_nothing(bench: Bench) -> None:
+def test_a_dry_run_writes_nothing(bench: Bench) -> None:
     text = bench.target.dry_run([flow(bench)])
 
     assert "add table inet flowqos_robot" in text
     assert bench.tables() == []
 
 
-def test_without_privilege_a_dry_run_is_checked_all_the_same_and_an_apply_says_what_it_needs(
-    bench: Bench,
-) -> None:
+def test_without_privilege_an_apply_says_what_it_needs(bench: Bench) -> None:
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
     tool = HostTool(bench.one.command(*nobody))
-    allowed = tool.run(["unshare", "-Urn", "true"]).returncode == 0
     target = NftTarget(None, Means(bench.ledger), tool)
 
-    text = target.dry_run([flow(bench)])
     with pytest.raises(PrivilegeError) as caught:
         target.apply([flow(bench)])
 
-    unchecked = text.startswith("# Not checked: this kernel allows no user namespaces.")
-    assert unchecked is not allowed
     assert str(caught.value) == (
         "cannot read nft table inet flowqos_robot: 'nft -s list table inet flowqos_robot' "
         "needs CAP_NET_ADMIN in this network namespace; run this command as root, or give it that "

@@ -469,7 +469,7 @@ def _programming(function: F) -> F:
 
 @command.command("apply")
 @_programming
-@click.option("--dry-run", is_flag=True, help="Print what would be sent; check it if possible.")
+@click.option("--dry-run", is_flag=True, help="Print what would be sent.")
 def _apply(
     *,
     manifest: str,

@@ -113,19 +113,6 @@ def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> Non
     assert NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()]).warnings == ()
 
 
-def test_a_dry_run_that_no_privilege_can_check_says_so_in_its_first_line(tmp_path: Path) -> None:
-    refused = failed("netlink: Error: cache initialization failed: Operation not permitted")
-    no_namespaces = failed("unshare: unshare failed: Operation not permitted")
-    tool = FakeTool(("nft -c", refused), ("unshare", no_namespaces))
-
-    text = NftTarget(None, Means(ledger_in(tmp_path)), tool).dry_run([rule()])
-
-    first, _, rest = text.partition("\n")
-    assert first == "# Not checked: this kernel allows no user namespaces."
-    assert "add table inet flowqos_robot" in rest
-    assert tool.lines == ["nft -c -f -", "unshare -Urn nft -c -f -"]
-
-
 def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
     ledger = ledger_in(tmp_path)
     tool = FakeTool(("nft -s list", NO_TABLE), ("nft -f", failed("Error: no memory")))
