@@ -142,19 +142,17 @@ class CamaraTarget(ServerTarget):
             status=reply.status,
         )
 
-    def find(self, body: Body) -> Made | None:
-        """Look through the device's sessions for one that asks for the same."""
+    def look(self, id_: str, body: Body) -> Made | None:
+        """GET it, or all of the device; one that has ended differs, for it is deleted first."""
+        if id_:
+            reply = self._api.request("GET", self.path(id_), may_be_gone=True)
+            return None if reply.gone else self._made(reply.read(_Session), body)
         asked = {"device": body["device"]} if "device" in body else {}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
         for each in () if reply.gone else reply.read(tuple[_Session, ...]):
             if not differs(body, each, _COMPARED, missing=True):
                 return self._made(each, body)
         return None
-
-    def see(self, id_: str, body: Body) -> Made | None:
-        """GET it; one that has ended counts as different, for it has to be deleted first."""
-        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        return None if reply.gone else self._made(reply.read(_Session), body)
 
     def renew(self) -> float | None:
         """Prolong sessions that are due; return seconds until the next is.
@@ -172,7 +170,7 @@ class CamaraTarget(ServerTarget):
 
     def _prolong(self, entry: Entry) -> None:
         made = self._prolonged(entry, json.loads(entry.body))
-        self._note(replace(entry, id=made.id, expires_s=made.expires_s))
+        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
 
     def _prolonged(self, entry: Entry, body: Body) -> Made:
         """Extend a session; make a new one where it cannot be extended any further."""

@@ -19,9 +19,8 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.patience import Clock, Deadline, Patience
-from lifecycle.programming.settings import Token, readable
-from lifecycle.programming.target import HttpError, MissingFeatureError, SettingsError
+from lifecycle.programming.settings import ServerSettings, readable
+from lifecycle.programming.target import HttpError, Means, MissingFeatureError, SettingsError
 
 try:
     import httpx
@@ -124,39 +123,31 @@ class Api:
     """One server's interface.
 
     Args:
+        settings: where it is, its token, and how long one attempt may take, from looking the name
+            up to the last byte of the answer.
+        means: bound all requests together.
+
+    Attributes:
         url: what every path is appended to.
-        token: sent as a bearer token; None sends none.
-        timeout_s: of one attempt, from looking the name up to the last byte of the answer.
-        patience: see Patience.
         clock: see Clock.
-        deadline: bounds all requests together; None does not.
 
     Raises:
         MissingFeatureError: httpx, the extra `networks`, is not installed.
         SettingsError: a proxy that the environment names cannot be used.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        token: Token | None = None,
-        timeout_s: float = 10.0,
-        patience: Patience | None = None,
-        clock: Clock | None = None,
-        deadline: Deadline | None = None,
-    ) -> None:
-        self.url = url.rstrip("/")
+    def __init__(self, settings: ServerSettings, means: Means) -> None:
+        self.url = settings.scope
         if httpx is None:
             raise MissingFeatureError(
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
-        self.clock = clock or Clock()
-        self._token = token
-        self._timeout_s = timeout_s
-        self._patience = patience or Patience()
-        self._deadline = deadline or Deadline()
+        self.clock = means.clock
+        self._token = settings.token
+        self._timeout_s = settings.timeout_s
+        self._patience = means.patience
+        self._deadline = means.deadline
         self._certificates = httpx.create_ssl_context()
         self._client()  # so that a proxy that cannot be used is an error at once
 

@@ -61,6 +61,7 @@ class TargetRecord(msgspec.Struct, frozen=True, kw_only=True):
         target: "nft", "tc", "nef" or "camara".
         scope: which one of that kind: a table, a device, a URL.
         settings: path of the settings file that says how to get there; empty if none is needed.
+        entries: nothing of ours is there without any.
         found: digest of a host's table as it was after writing; empty while it is written.
         beside: digest of what was made beside that table.
     """
@@ -115,7 +116,7 @@ class Ledger:
 
         Raises:
             ProgrammingError: another process keeps it for too long.
-        UsageError: others can write where it is kept.
+            UsageError: others can write where it is kept.
         """
         # What others can write would make us delete what is not ours.
         for each in (self._directory.parent, self._directory):
@@ -159,18 +160,15 @@ class Ledger:
         return next(found, None)
 
     def put(self, record: TargetRecord) -> None:
-        """Write down what is ours in one network, in place of what was written of it."""
-        self._write(record, record)
+        """Write down what is ours in one network, in place of what was written of it.
 
-    def drop(self, record: TargetRecord) -> None:
-        """Nothing of ours is left in the network of a record."""
-        if self.find(record) is not None:
-            self._write(record)
-
-    def _write(self, of: TargetRecord, *instead: TargetRecord) -> None:
+        Raises:
+            ProgrammingError: it cannot be read or written.
+        """
         before = self.read()
-        others = [each for each in before.targets if each.network != of.network]
-        targets = (*others, *instead)
+        targets = [each for each in before.targets if each.network != record.network]
+        if record.entries:
+            targets.append(record)
         if not targets:
             self._path.unlink(missing_ok=True)
             return
@@ -181,7 +179,7 @@ class Ledger:
             owner = ChildRecord(name="supervisor", pid=pid, start_ticks=start_ticks(pid) or 0)
         part = self._path.with_name(f".{LEDGER_NAME}")
         text = to_json(
-            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
+            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=tuple(targets))
         )
         try:
             with part.open("wb") as file:

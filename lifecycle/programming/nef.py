@@ -142,18 +142,18 @@ class NefTarget(ServerTarget):
             raise reply.unusable("it has neither a Location nor a self")
         return Made(id=reply.linked(made), detail=_refused(shown))
 
-    def find(self, body: Body) -> Made | None:
-        """Look through our subscriptions for one that asks for the same."""
-        reply = self._api.request("GET", self.collection, may_be_gone=True)
-        for each in () if reply.gone else reply.read(tuple[_Subscription, ...]):
+    def look(self, id_: str, body: Body) -> Made | None:
+        """GET it, or all of ours."""
+        path = self.path(id_) if id_ else self.collection
+        reply = self._api.request("GET", path, may_be_gone=True)
+        if reply.gone:
+            return None
+        if id_:
+            return Made(id=id_, differs=_differs(body, _shown(reply)))
+        for each in reply.read(tuple[_Subscription, ...]):
             if each.link and not _differs(body, each, missing=True):
                 return Made(id=reply.linked(each.link))
         return None
-
-    def see(self, id_: str, body: Body) -> Made | None:
-        """GET it."""
-        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        return None if reply.gone else Made(id=id_, differs=_differs(body, _shown(reply)))
 
     def update(self, id_: str, before: Body, body: Body) -> Made:
         """PUT it, so that what the network has reserved for a flow stays reserved."""

@@ -158,14 +158,7 @@ class ServerTarget(Target):
     def __init__(self, settings: str, means: Means) -> None:
         super().__init__(settings, means)
         self._server: Any = self._of_file(settings)
-        self._api = Api(
-            self._server.scope,
-            token=self._server.token,
-            timeout_s=self._server.timeout_s,
-            patience=means.patience,
-            clock=means.clock,
-            deadline=means.deadline,
-        )
+        self._api = Api(self._server, means)
         path = str(Path(settings).absolute())
         self._record = TargetRecord(target=self.kind, scope=self._api.url, settings=path)
         self.name = f"{self.kind} at {self._api.url}"
@@ -262,12 +255,13 @@ class ServerTarget(Target):
         """Ask for it."""
 
     @abc.abstractmethod
-    def find(self, body: Body) -> Made | None:
-        """Look for one that was asked for with this body; None if there is none."""
+    def look(self, id_: str, body: Body) -> Made | None:
+        """Look at one, and compare it with what was asked for; None if there is none.
 
-    @abc.abstractmethod
-    def see(self, id_: str, body: Body) -> Made | None:
-        """Look at one, and compare it with what was asked for; None if it is gone."""
+        Args:
+            id_: what the server calls it; empty looks for one that is just as asked for.
+            body: that was asked for.
+        """
 
     def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - may be compared
         """Change one; here by a new one, after the old, as two for one flow may be a conflict."""
@@ -322,17 +316,12 @@ class ServerTarget(Target):
         if entry is None:
             return ChangeKind.CREATE, ""
         asked: Body = json.loads(entry.body)
-        if not entry.id:
-            found = self.find(asked)
-            if found is None:
-                return ChangeKind.CREATE, "asked for before, but never made"
-            entry = replace(entry, id=found.id)
-            self._note(entry)
-        seen = self.see(entry.id, asked)
+        seen = self.look(entry.id, asked)
         if seen is None:
-            return ChangeKind.CREATE, "gone from the server"
-        if (seen.expires_s or math.inf) < (entry.expires_s or math.inf) - 1:
-            self._note(replace(entry, expires_s=seen.expires_s))
+            gone = "gone from the server" if entry.id else "asked for before, but never made"
+            return ChangeKind.CREATE, gone
+        if not entry.id or (seen.expires_s or math.inf) < (entry.expires_s or math.inf) - 1:
+            self._note(entry.key, replace(entry, id=seen.id, expires_s=seen.expires_s))
         if asked != body:
             return ChangeKind.UPDATE, ""
         if seen.differs:
@@ -361,31 +350,31 @@ class ServerTarget(Target):
         asked = json.loads(entry.body)
         if change.kind is ChangeKind.UPDATE:
             made = self.update(entry.id, asked, body)
-            self._note(_entry(change, body, made))
+            self._note(change.key, _entry(change, body, made))
             return replace(change, detail=made.detail or change.detail)
-        found = Made(id=entry.id) if entry.id else self.find(asked)
+        found = Made(id=entry.id) if entry.id else self.look("", asked)
         if found is not None:
             self.delete(found.id)
-        self._forget(change.key)
+        self._note(change.key, None)
         return change
 
     def _create(self, change: FlowChange, body: Body) -> Made:
-        self._note(_entry(change, body, None))
+        self._note(change.key, _entry(change, body, None))
+        made: Made | None = None
         try:
             made = self.create(body)
         except HttpError as error:
             if not error.uncertain:
-                self._forget(change.key)
+                self._note(change.key, None)
                 raise
             try:
-                found = self.find(body)
+                made = self.look("", body)
             except HttpError as second:
                 raise error from second
-            if found is None:
+            if made is None:
                 # The entry stays pending: the server may still be making it.
                 raise
-            made = found
-        self._note(_entry(change, body, made))
+        self._note(change.key, _entry(change, body, made))
         return made
 
     def _entries(self) -> dict[str, Entry]:
@@ -393,16 +382,10 @@ class ServerTarget(Target):
         found = self._ledger.find(self._record)
         return {each.key: each for each in found.entries} if found else {}
 
-    def _note(self, entry: Entry) -> None:
-        every = {**self._entries(), entry.key: entry}
-        self._ledger.put(replace(self._record, entries=tuple(every.values())))
-
-    def _forget(self, key: str) -> None:
-        every = tuple(each for name, each in self._entries().items() if name != key)
-        if every:
-            self._ledger.put(replace(self._record, entries=every))
-        else:
-            self._ledger.drop(self._record)
+    def _note(self, key: str, entry: Entry | None) -> None:
+        every = {**self._entries(), key: entry}
+        entries = tuple(each for each in every.values() if each is not None)
+        self._ledger.put(replace(self._record, entries=entries))
 
 
 def differs(

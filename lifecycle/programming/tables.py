@@ -250,7 +250,7 @@ class TableTarget(Target):
         if known is None:
             return TargetChanges(target=self.name)
         there = self.clear()
-        self._ledger.drop(known)
+        self._ledger.put(self._record)
         gone = [FlowChange(kind=ChangeKind.DELETE, key=each.key) for each in known.entries]
         return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
 
@@ -299,7 +299,7 @@ class TableTarget(Target):
             except ProgrammingError as left:
                 message = f"{error.message}; what was made is left: {left}"
                 raise type(error)(message, hint=error.hint) from error
-            self._ledger.drop(record)
+            self._ledger.put(self._record)
             raise
 
 

@@ -17,8 +17,10 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import BringUpError
-from lifecycle.programming.http import Api, Patience
+from lifecycle.programming.http import Api
+from lifecycle.programming.patience import Patience
 from lifecycle.programming.programmer import Programmer
+from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import (
     HttpError,
     Means,
@@ -482,11 +484,14 @@ class TestProxies:
         "proxy", ["socks5://127.0.0.1:1", "gopher://me:hunter2@x", "http://:0x"]
     )
     def test_a_proxy_that_cannot_be_used_is_one_clear_error(
-        self, proxy: str, monkeypatch: pytest.MonkeyPatch
+        self, proxy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("ALL_PROXY", proxy)
         with pytest.raises(SettingsError) as caught:
-            Api("https://nef.example.net")
+            Api(
+                ServerSettings(url="https://nef.example.net", devices=("10.45.0.0/16",)),
+                Means(ledger_in(tmp_path)),
+            )
 
         assert str(caught.value) == (
             "cannot reach https://nef.example.net through the proxy that the environment names: "

@@ -230,14 +230,14 @@ def test_a_ledger_keeps_targets_apart_and_vanishes_with_the_last_entry(tmp_path:
     ledger = ledger_in(tmp_path)
     entry = Entry(key="k", what="w")
     one = TargetRecord(target="nft", scope="t", entries=(entry,))
-    other = TargetRecord(target="tc", scope="eth0")
+    other = TargetRecord(target="tc", scope="eth0", entries=(entry,))
 
     ledger.put(one)
     ledger.put(other)
     assert ledger.find(one) == one
-    ledger.drop(one)
+    ledger.put(replace(one, entries=()))
     assert ledger.read().targets == (other,)
-    ledger.drop(other)
+    ledger.put(replace(other, entries=()))
 
     assert not (tmp_path / "run" / "robot@7" / "programmed.json").exists()
 
@@ -275,7 +275,7 @@ def test_a_ledger_of_a_living_supervisor_is_no_orphan_and_of_a_dead_one_is(
 ) -> None:
     ledger_in(tmp_path)
     owned = Ledger(tmp_path / "run" / "robot@7", "robot", owned=True)
-    owned.put(TargetRecord(target="nft", scope="t"))
+    owned.put(TargetRecord(target="nft", scope="t", entries=(Entry(key="k", what="w"),)))
     file = owned.read()
 
     assert file.owner is not None
