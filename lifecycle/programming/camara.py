@@ -18,14 +18,7 @@ from msgspec.structs import replace
 from lifecycle.programming.http import ID_PATTERN, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.server import (
-    Body,
-    DeviceEnd,
-    Made,
-    ServerTarget,
-    class_name,
-    differs,
-)
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import HttpError, PartlyError, each_done
 

@@ -20,7 +20,7 @@ import msgspec
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.settings import ServerSettings, readable
-from lifecycle.programming.target import HttpError, Means, MissingFeatureError, SettingsError
+from lifecycle.programming.target import HttpError, Means, ProgrammingError, SettingsError
 
 try:
     import httpx
@@ -132,14 +132,14 @@ class Api:
         clock: see Clock.
 
     Raises:
-        MissingFeatureError: httpx, the extra `networks`, is not installed.
+        ProgrammingError: httpx, the extra `networks`, is not installed.
         SettingsError: a proxy that the environment names cannot be used.
     """
 
     def __init__(self, settings: ServerSettings, means: Means) -> None:
         self.url = settings.scope
         if httpx is None:
-            raise MissingFeatureError(
+            raise ProgrammingError(
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
@@ -287,7 +287,7 @@ class Api:
             try:
                 coding = answer.headers.get("content-encoding", "identity")
                 if coding.strip().lower() not in ("", "identity"):
-                    raise httpx.RemoteProtocolError(f"packed as {coding!r}, unasked")
+                    raise httpx.RemoteProtocolError("it is packed, which was not asked for")
                 async for chunk in answer.aiter_raw():
                     body += chunk
                     if len(body) > _LARGEST_ANSWER:

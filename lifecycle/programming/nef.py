@@ -18,14 +18,7 @@ from msgspec.structs import replace
 
 from lifecycle.programming.http import Reply, as_segment, text_of
 from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
-from lifecycle.programming.server import (
-    Body,
-    DeviceEnd,
-    Made,
-    ServerTarget,
-    class_name,
-    differs,
-)
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 from lifecycle.programming.settings import ServerSettings
 
 _FIXED = ("ueIpv4Addr", "ueIpv6Addr")

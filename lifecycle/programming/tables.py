@@ -24,8 +24,6 @@ from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
     Means,
-    MissingFeatureError,
-    NotOursError,
     ProgrammingError,
     Target,
     TargetChanges,
@@ -177,8 +175,7 @@ class TableTarget(Target):
         """Return what is there of ours, as the host shows it; empty if nothing is.
 
         Raises:
-            NotOursError: an object of this name is not ours.
-            PrivilegeError: reading needs the same privilege as writing.
+            ProgrammingError: an object of this name is not ours, or may not be read.
         """
         return self.listing()
 
@@ -197,8 +194,7 @@ class TableTarget(Target):
         """Return the table as nft shows it, without counts; empty if there is none.
 
         Raises:
-            NotOursError: a table of this name is not ours.
-            PrivilegeError: reading needs the same privilege as writing.
+            ProgrammingError: a table of this name is not ours, or may not be read.
         """
         argv = ["nft", "-s", "list", "table", "inet", self._table]
         table = f"nft table inet {self._table}"
@@ -208,7 +204,7 @@ class TableTarget(Target):
                 return ""
             raise failure(output, argv, doing=f"read {table}")
         if _MANAGED not in output.stdout:
-            raise NotOursError(
+            raise ProgrammingError(
                 f"cannot use {table}: it exists and is not marked as managed by lifecycle",
                 hint=f"look at it: nft list table inet {self._table}",
             )
@@ -231,8 +227,7 @@ class TableTarget(Target):
         """Compare what was written, and what is there, with the rules.
 
         Raises:
-            NotOursError: what is there is not ours.
-            PrivilegeError: reading needs the same privilege as writing.
+            ProgrammingError: what is there is not ours, or may not be read.
         """
         return self._brought(rules, write=False)
 
@@ -259,7 +254,7 @@ class TableTarget(Target):
         try:
             wanted = self.wanted(placed, self._settings, self._ledger.system)
         except ValueError as error:
-            raise MissingFeatureError(str(error)) from error
+            raise ProgrammingError(str(error)) from error
         entries = tuple(
             Entry(key=rule.key, what=describe_rule(rule), body="\n".join(lines))
             for rule, lines in placed
@@ -298,7 +293,7 @@ class TableTarget(Target):
                     self.clear()
             except ProgrammingError as left:
                 message = f"{error.message}; what was made is left: {left}"
-                raise type(error)(message, hint=error.hint) from error
+                raise ProgrammingError(message, hint=error.hint) from error
             self._ledger.put(self._record)
             raise
 

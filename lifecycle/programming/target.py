@@ -278,21 +278,9 @@ def describe_rule(rule: FlowRule) -> str:
 
 
 class ProgrammingError(LifecycleError):
-    """A network refused, or could not be reached or read."""
+    """A network refused, or could not be reached or read; or what is there is not ours."""
 
     exit_code = ExitCode.BRING_UP_FAILED
-
-
-class PrivilegeError(ProgrammingError):
-    """A command needs a privilege that this process lacks."""
-
-
-class MissingFeatureError(ProgrammingError):
-    """The kernel or the machine lacks something: a queueing discipline, a program."""
-
-
-class NotOursError(ProgrammingError):
-    """An object that is not ours is in the way; it is never touched."""
 
 
 class SettingsError(UsageError):

@@ -39,7 +39,7 @@ from lifecycle.programming.tables import (
     render_table,
     table_name,
 )
-from lifecycle.programming.target import Means, NotOursError, ProgrammingError
+from lifecycle.programming.target import Means, ProgrammingError
 from lifecycle.programming.tool import HostTool, Qdisc, demand, qdiscs
 
 OWNED_HANDLE = "1f10:"
@@ -439,13 +439,13 @@ class TcTarget(TableTarget):
         if root.handle == "0:":
             return False
         if root.handle != OWNED_HANDLE:
-            raise NotOursError(
+            raise ProgrammingError(
                 f"cannot use {self.name}: it has a root qdisc of another owner, {root.kind} "
                 f"{root.handle}",
                 hint=f"use another device, or remove it: tc qdisc del dev {device} root",
             )
         if self._ledger.find(self._record) is None and not self.listing():
-            raise NotOursError(
+            raise ProgrammingError(
                 f"cannot use {self.name}: its root qdisc {root.handle} was made by lifecycle, but "
                 f"not for system {self._ledger.system!r} of this user",
                 hint="if nothing uses it any more: "

@@ -1,7 +1,6 @@
 """Runs nft and tc: bounded, asked in English, each refusal as one sentence.
 
-Owns: what their refusals mean: a missing program, a missing privilege, a missing kernel feature;
-and the qdiscs that tc lists.
+Owns: what their refusals mean: a missing program, a missing privilege; and the qdiscs that tc lists.
 """
 
 from __future__ import annotations
@@ -15,11 +14,7 @@ from collections.abc import Sequence
 import msgspec
 
 from lifecycle.codec import from_json
-from lifecycle.programming.target import (
-    MissingFeatureError,
-    PrivilegeError,
-    ProgrammingError,
-)
+from lifecycle.programming.target import ProgrammingError
 from lifecycle.run_directory import OWN_CHILD
 
 _TIMEOUT_S = 10.0
@@ -34,12 +29,6 @@ HOW_PRIVILEGED = (
 """Root is not enough where the capability was taken away: capabilities(7)."""
 
 _NO_PRIVILEGE = re.compile(r"operation not permitted|permission denied|must be root", re.IGNORECASE)
-_NO_FEATURE = re.compile(
-    r"qdisc kind is unknown|classifier not found|unknown qdisc|"
-    r"protocol not supported|operation not supported",
-    re.IGNORECASE,
-)
-
 
 Output = subprocess.CompletedProcess[str]
 """What a program left."""
@@ -59,8 +48,7 @@ class HostTool:
         """Run a program to its end and return what it left, whatever its exit code.
 
         Raises:
-            MissingFeatureError: it is not installed.
-            ProgrammingError: it does not end.
+            ProgrammingError: it is not installed, or does not end.
         """
         # Distributions keep these in sbin, which is not on every user's path.
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
@@ -79,7 +67,7 @@ class HostTool:
         except FileNotFoundError as error:
             program = str(error.filename or argv[0])
             package = _PACKAGES.get(program, program)
-            raise MissingFeatureError(
+            raise ProgrammingError(
                 f"cannot run {program!r}: it is not installed",
                 hint=f"install it: apt-get install {package}",
             ) from error
@@ -101,9 +89,7 @@ def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") 
         stdin: what it reads.
 
     Raises:
-        PrivilegeError: it needs a privilege; says which command.
-        MissingFeatureError: the kernel or the program is missing something.
-        ProgrammingError: it failed otherwise, with its own message.
+        ProgrammingError: see `failure`.
     """
     output = tool.run(argv, stdin=stdin)
     if output.returncode == 0:
@@ -143,15 +129,13 @@ def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
 
 
 def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
-    """Return the error that a failed program means."""
+    """Return the error that a failed program means: a missing privilege, or what it says itself."""
     command = shlex.join(argv)
     printed = filter(None, map(str.strip, output.stderr.splitlines()))
     said = next(printed, f"exit code {output.returncode}")
     if _NO_PRIVILEGE.search(output.stderr):
-        return PrivilegeError(
+        return ProgrammingError(
             f"cannot {doing}: {command!r} needs CAP_NET_ADMIN in this network namespace",
             hint=HOW_PRIVILEGED,
         )
-    if _NO_FEATURE.search(output.stderr):
-        return MissingFeatureError(f"cannot {doing}: {command!r} says {said!r}")
     return ProgrammingError(f"cannot {doing}: {command!r} says {said!r}")

@@ -13,7 +13,7 @@ import pytest
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import ChangeKind, Means, NotOursError, PrivilegeError
+from lifecycle.programming.target import ChangeKind, Means, ProgrammingError
 from lifecycle.programming.tool import HostTool
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
@@ -152,7 +152,7 @@ def test_a_table_of_this_name_that_is_not_ours_is_refused_and_stays(bench: Bench
     theirs = FOREIGN.replace("theirs", "flowqos_robot")
     bench.one.run("nft", "-f", "-", stdin=theirs)
 
-    with pytest.raises(NotOursError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         bench.target.apply([flow(bench)])
     assert str(caught.value) == (
         "cannot use nft table inet flowqos_robot: it exists and is not marked as managed by "
@@ -186,7 +186,7 @@ def test_without_privilege_an_apply_says_what_it_needs(bench: Bench) -> None:
     tool = HostTool(bench.one.command(*nobody))
     target = NftTarget(None, Means(bench.ledger), tool)
 
-    with pytest.raises(PrivilegeError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         target.apply([flow(bench)])
 
     assert str(caught.value) == (

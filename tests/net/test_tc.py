@@ -13,14 +13,7 @@ import pytest
 
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import (
-    ChangeKind,
-    Means,
-    NotOursError,
-    PrivilegeError,
-    ProgrammingError,
-    TargetChanges,
-)
+from lifecycle.programming.target import ChangeKind, Means, ProgrammingError, TargetChanges
 from lifecycle.programming.tc import TcSettings, TcTarget
 from lifecycle.programming.tool import HostTool, Output
 from tests.net.hosts import Host
@@ -197,7 +190,7 @@ def test_a_root_qdisc_of_somebody_else_is_refused_and_stays(bench: Bench) -> Non
     bench.one.run("tc", "qdisc", "add", "dev", "e0", "root", "handle", "7:", "htb")
     before = everything(bench.one)
 
-    with pytest.raises(NotOursError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         bench.target().apply([bench.rule()])
 
     assert str(caught.value) == (
@@ -212,7 +205,7 @@ def test_two_systems_do_not_share_a_device(bench: Bench, tmp_path: Path) -> None
     bench.target().apply([bench.rule()])
     other = Bench(bench.one, bench.other, ledger_in(tmp_path, "arm"))
 
-    with pytest.raises(NotOursError, match="made by lifecycle, but not for system 'arm'"):
+    with pytest.raises(ProgrammingError, match="made by lifecycle, but not for system 'arm'"):
         other.target().apply([bench.rule()])
     other.target().remove()
 
@@ -243,7 +236,7 @@ def test_without_privilege_one_line_says_what_is_needed(
 
     # Looking needs no privilege.
     assert kinds(target.plan([bench.rule()])) == ["create"]
-    with pytest.raises(PrivilegeError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         target.apply([bench.rule()])
 
     assert str(caught.value) == (

@@ -18,12 +18,7 @@ from lifecycle.programming.target import (
     TargetChanges,
     read_targets,
 )
-from tests.unit.programming.samples import (
-    camara_settings,
-    ledger_in,
-    rule,
-    settings_file,
-)
+from tests.unit.programming.samples import camara_settings, ledger_in, rule, settings_file
 from tests.unit.programming.servers import TOKEN, Answer, Asked, CamaraServer, Clock
 
 

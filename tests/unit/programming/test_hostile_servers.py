@@ -203,7 +203,7 @@ HOSTILE: dict[str, tuple[str, Behave, str]] = {
     "gzip, which is not asked for": (
         "nef",
         answers(gzip.compress(b" " * 99_000_000), content_encoding="gzip"),
-        "packed as 'gzip', unasked",
+        "it is packed, which was not asked for",
     ),
     "deep JSON": ("camara", answers(DEEP), "its body: "),
     "no JSON": ("camara", answers(b"<html>"), "its body: JSON is malformed"),

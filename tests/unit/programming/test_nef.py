@@ -20,12 +20,7 @@ from lifecycle.programming.target import (
     TargetChanges,
     read_targets,
 )
-from tests.unit.programming.samples import (
-    ledger_in,
-    nef_settings,
-    rule,
-    settings_file,
-)
+from tests.unit.programming.samples import ledger_in, nef_settings, rule, settings_file
 from tests.unit.programming.servers import TOKEN, Answer, Clock, NefServer
 
 PROBLEM = "application/problem+json"

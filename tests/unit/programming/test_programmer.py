@@ -10,13 +10,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.programming import ledger as ledger_module
-from lifecycle.programming.ledger import (
-    Entry,
-    Ledger,
-    LedgerFile,
-    TargetRecord,
-    owner_is_dead,
-)
+from lifecycle.programming.ledger import Entry, Ledger, LedgerFile, TargetRecord, owner_is_dead
 from lifecycle.programming.programmer import (
     Programmer,
     removal_of,
@@ -36,12 +30,7 @@ from lifecycle.verify.outcome import Outcome
 from tests.builders import nfe
 from tests.unit.programming.fakes import FakeTarget
 from tests.unit.programming.flow_samples import plan, report
-from tests.unit.programming.samples import (
-    ledger_in,
-    nef_settings,
-    rule,
-    settings_file,
-)
+from tests.unit.programming.samples import ledger_in, nef_settings, rule, settings_file
 from tests.unit.programming.servers import Answer, NefServer
 
 

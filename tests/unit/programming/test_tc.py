@@ -9,20 +9,8 @@ from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
 from lifecycle.programming.rules import RuleSet
-from lifecycle.programming.tc import (
-    TcMatch,
-    TcSettings,
-    TcTarget,
-    class_of,
-    classes_of,
-    divide,
-)
-from tests.unit.programming.flow_samples import (
-    EXPECTED,
-    LEFT_OUT,
-    RULES,
-    VIDEO,
-)
+from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget, class_of, classes_of, divide
+from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO
 
 
 def settings(**rest: object) -> TcSettings:

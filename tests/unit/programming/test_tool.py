@@ -14,8 +14,6 @@ from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
     Means,
-    MissingFeatureError,
-    PrivilegeError,
     ProgrammingError,
     TargetChanges,
 )
@@ -34,11 +32,10 @@ QDISCS = [
 
 
 @pytest.mark.parametrize(
-    ("stderr", "kind", "message"),
+    ("stderr", "message"),
     [
         (
             "Operation not permitted (you must be root)\nnetlink: Error: cache",
-            PrivilegeError,
             (
                 "cannot mark: 'nft -f -' needs CAP_NET_ADMIN in this network namespace; "
                 "run this command as root, or give it that capability: in a container --cap-add "
@@ -47,31 +44,26 @@ QDISCS = [
         ),
         (
             "Error: Specified qdisc kind is unknown.\n",
-            MissingFeatureError,
             "cannot mark: 'nft -f -' says 'Error: Specified qdisc kind is unknown.'",
         ),
         (
             "\n  syntax error, unexpected newline\n",
-            ProgrammingError,
             "cannot mark: 'nft -f -' says 'syntax error, unexpected newline'",
         ),
-        ("", ProgrammingError, "cannot mark: 'nft -f -' says 'exit code 1'"),
+        ("", "cannot mark: 'nft -f -' says 'exit code 1'"),
     ],
 )
-def test_a_refusal_is_told_as_what_it_is(
-    stderr: str, kind: type[ProgrammingError], message: str
-) -> None:
+def test_a_refusal_is_told_as_what_it_is(stderr: str, message: str) -> None:
     with pytest.raises(ProgrammingError) as caught:
         demand(FakeTool(("nft", failed(stderr))), ["nft", "-f", "-"], doing="mark")
 
-    assert type(caught.value) is kind
     assert str(caught.value) == message
 
 
 def test_a_program_that_is_not_installed_is_told_with_its_package(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(MissingFeatureError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         HostTool(("nft-of-nowhere",)).run(["nft"])
 
     assert str(caught.value) == (
@@ -106,7 +98,7 @@ def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> N
 
 def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> None:
     def missing() -> Output:
-        raise MissingFeatureError("cannot run 'tc'")
+        raise ProgrammingError("cannot run 'tc'")
 
     tool = FakeTool(("nft -s list", NO_TABLE), ("tc", missing))
 
