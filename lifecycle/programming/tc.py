@@ -173,14 +173,35 @@ class TrafficClass(msgspec.Struct, frozen=True, kw_only=True, order=True):
         return self.rank[0] > _RANK_DEFAULT
 
 
+_REST = TrafficClass(
+    rank=(_RANK_DEFAULT, 0), name="everything else", minor=DEFAULT_MINOR, comment="everything else"
+)
+
+
 def class_of(rule: FlowRule) -> TrafficClass | None:
     """Return the class of a rule, by its DSCP or else its 5QI; None if it stays with the rest.
 
     DF is the rest itself.
     """
-    if rule.dscp is not None:
-        return None if rule.dscp == 0 else _by_dscp(rule.dscp)
-    return None if rule.five_qi is None else _by_five_qi(rule.five_qi)
+    if rule.dscp:
+        name = dscp_name(rule.dscp).lower()
+        group = _RANK_LOWEST if rule.dscp in _LOWEST else _RANK_MARKED
+        return TrafficClass(
+            rank=(_RANK_FIRST if rule.dscp in _FIRST else group, -rule.dscp),
+            name=f"dscp{name}" if name.isdecimal() else name,
+            minor=0x100 + rule.dscp,
+            comment=describe(rule.dscp),
+        )
+    if rule.dscp is None and rule.five_qi is not None:
+        five_qi = five_qi_of(rule.five_qi)
+        group = _RANK_GBR if five_qi.resource_type.guarantees_rate else _RANK_NON_GBR
+        return TrafficClass(
+            rank=(group, five_qi.priority_level),
+            name=f"5qi{rule.five_qi}",
+            minor=0x200 + rule.five_qi,
+            comment=str(five_qi),
+        )
+    return None
 
 
 def classes_of(rules: Iterable[FlowRule]) -> tuple[TrafficClass, ...]:
@@ -188,36 +209,10 @@ def classes_of(rules: Iterable[FlowRule]) -> tuple[TrafficClass, ...]:
     return tuple(sorted({found for rule in rules if (found := class_of(rule)) is not None}))
 
 
-def _by_dscp(dscp: int) -> TrafficClass:
-    name = dscp_name(dscp).lower()
-    group = _RANK_MARKED
-    if dscp in _FIRST:
-        group = _RANK_FIRST
-    elif dscp in _LOWEST:
-        group = _RANK_LOWEST
-    return TrafficClass(
-        rank=(group, -dscp),
-        name=f"dscp{name}" if name.isdecimal() else name,
-        minor=0x100 + dscp,
-        comment=describe(dscp),
-    )
-
-
-def _by_five_qi(value: int) -> TrafficClass:
-    five_qi = five_qi_of(value)
-    group = _RANK_GBR if five_qi.resource_type.guarantees_rate else _RANK_NON_GBR
-    return TrafficClass(
-        rank=(group, five_qi.priority_level),
-        name=f"5qi{value}",
-        minor=0x200 + value,
-        comment=str(five_qi),
-    )
-
-
 def divide(
-    classes: Iterable[TrafficClass], *, link_kbit: int, guaranteed_kbit: Mapping[str, int] = {}
-) -> tuple[dict[str, int], int]:
-    """Return the guaranteed rate of each class by name, and that of the rest, in kbit/s.
+    classes: Sequence[TrafficClass], *, link_kbit: int, guaranteed_kbit: Mapping[str, int] = {}
+) -> dict[TrafficClass, int]:
+    """Return the guaranteed rate of each class and of the rest, in kbit/s, the first in front.
 
     Classes without a given rate share what is left equally with the rest; those below the rest
     get a hundredth of the link, so that they do not starve.
@@ -231,34 +226,36 @@ def divide(
     Raises:
         ValueError: a rate is not positive, an unknown class has one, or there is not enough.
     """
-    every = tuple(classes)
-    known = ", ".join(each.name for each in every) or "none"
+    names = [each.name for each in classes]
     if link_kbit < 1:
         raise ValueError(f"cannot divide a link of {link_kbit} kbit/s; use 1 or more")
     for name, rate in guaranteed_kbit.items():
-        if name not in {each.name for each in every}:
+        if name not in names:
             raise ValueError(
-                f"cannot guarantee a rate to class {name!r}; classes of these rules are: {known}"
+                f"cannot guarantee a rate to class {name!r}; classes of these rules are: "
+                f"{', '.join(names) or 'none'}"
             )
         if rate < 1:
             raise ValueError(f"cannot guarantee {rate} kbit/s to class {name}; use 1 or more")
-    rates = {
-        each.name: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))
+    every = sorted((*classes, _REST))
+    given = {
+        each: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))
         for each in every
         if each.below_default or each.name in guaranteed_kbit
     }
-    open_ = [each.name for each in every if each.name not in rates]
-    left = link_kbit - sum(rates.values())
-    share = left // (len(open_) + 1)
+    others = [each for each in every if each not in given]
+    left = link_kbit - sum(given.values())
+    share = left // len(others)
     if share < 1:
-        given = ", ".join(f"{name} {rate}" for name, rate in rates.items())
+        rates = ", ".join(f"{each.name} {rate}" for each, rate in given.items())
         raise ValueError(
-            f"cannot guarantee {sum(rates.values())} kbit/s ({given}) on a link of "
+            f"cannot guarantee {sum(given.values())} kbit/s ({rates}) on a link of "
             f"{link_kbit} kbit/s: something must be left for "
-            f"{', '.join((*open_, 'everything else'))}"
+            f"{', '.join(each.name for each in others)}"
         )
-    rates.update((name, share) for name in open_)
-    return {each.name: rates[each.name] for each in every}, left - share * len(open_)
+    found = {each: given.get(each, share) for each in every}
+    found[_REST] += left - share * len(others)
+    return found
 
 
 def _table_name(system: str, device: str) -> str:
@@ -268,20 +265,15 @@ def _table_name(system: str, device: str) -> str:
 
 def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]:
     device, link_kbit, major = settings.device, settings.link_kbit, OWNED_HANDLE
-    rates, rest = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
+    rates = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
     yield (
         f"class replace dev {device} parent {major} classid {major}1 "
         f"htb rate {link_kbit}kbit ceil {link_kbit}kbit quantum {_QUANTUM_BYTES}"
     )
-    above = [each for each in classes if not each.below_default]
-    below = [each for each in classes if each.below_default]
-    leaves = [
-        *((each.minor, rates[each.name], min(i, 5), each.comment) for i, each in enumerate(above)),
-        (DEFAULT_MINOR, rest, 6, "everything else"),
-        *((each.minor, rates[each.name], 7, each.comment) for each in below),
-    ]
-    for minor, rate, prio, comment in leaves:
-        yield f"# class {major}{minor:x}: {comment}"
+    for index, (class_, rate) in enumerate(rates.items()):
+        minor = class_.minor
+        prio = 7 if class_.below_default else 6 if class_ is _REST else min(index, 5)
+        yield f"# class {major}{minor:x}: {class_.comment}"
         yield (
             f"class replace dev {device} parent {major}1 classid {major}{minor:x} "
             f"htb rate {rate}kbit ceil {link_kbit}kbit prio {prio} quantum {_QUANTUM_BYTES}"

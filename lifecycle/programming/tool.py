@@ -1,6 +1,6 @@
 """Runs nft and tc: bounded, asked in English, each refusal as one sentence.
 
-Owns: what their refusals mean: a missing program, a missing privilege; and the qdiscs that tc lists.
+Owns: what their refusals mean, such as a missing privilege; and the qdiscs that tc lists.
 """
 
 from __future__ import annotations
