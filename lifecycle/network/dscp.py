@@ -34,7 +34,6 @@ class CodePoint(msgspec.Struct, frozen=True, kw_only=True):
         rfc: the document that assigns it.
         phb: per-hop behaviour.
         service_class: RFC 4594's service class; empty where it names none.
-        nft: how nftables spells it.
     """
 
     name: str
@@ -43,7 +42,6 @@ class CodePoint(msgspec.Struct, frozen=True, kw_only=True):
     rfc: str
     phb: str
     service_class: str
-    nft: str
 
 
 class _DscpTable(msgspec.Struct, frozen=True, kw_only=True):

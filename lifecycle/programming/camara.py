@@ -8,26 +8,21 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import math
 import re
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import LifecycleError
 from lifecycle.programming.http import ID_PATTERN, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 from lifecycle.programming.settings import ServerSettings
-from lifecycle.programming.target import HttpError, Means, PartlyError
+from lifecycle.programming.target import HttpError, PartlyError, each_done
 
-_COMPARED = {
-    "applicationServer": "application_server",
-    "devicePorts": "device_ports",
-    "applicationServerPorts": "application_server_ports",
-    "qosProfile": "qos_profile",
-}
+_COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
 
 _MARGIN = 0.2
 """A session is prolonged when this part of what was asked for is left, …"""
@@ -50,20 +45,18 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
     Attributes:
         url: everything before `/sessions`.
         qos_profiles: the provider's names of profiles, by 5QI.
-        default_qos_profile: for flows whose 5QI is not named; empty leaves them out.
         duration_s: 1–2147483647; sessions are renewed, or they expire.
         device_by_token: the access token names the device (three-legged), so that the body must
             not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
     """
 
     qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
-    default_qos_profile: str = ""
     duration_s: int = 3600
     device_by_token: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for profile in filter(None, (*self.qos_profiles.values(), self.default_qos_profile)):
+        for profile in self.qos_profiles.values():
             if not re.fullmatch(r"[a-zA-Z0-9_.-]{3,256}", profile):
                 raise ValueError(
                     f"cannot use qosProfile {profile!r}; "
@@ -73,7 +66,7 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
             raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
 
 
-class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """SessionInfo of QualityOnDemand 1.1.0, as far as it is read; None is not shown."""
 
     session_id: Annotated[str, msgspec.Meta(pattern=ID_PATTERN)]
@@ -99,11 +92,6 @@ class CamaraTarget(ServerTarget):
     settings_type = CamaraSettings
     collection = "/sessions"
 
-    def __init__(self, settings: str, means: Means) -> None:
-        super().__init__(settings, means)
-        self._expires: dict[str, tuple[float, float]] = {}
-        """By key, when a session expires: since the epoch, and on the clock that goes forward."""
-
     @staticmethod
     def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
         """Return the body of a CreateSession (QualityOnDemand 1.1.0).
@@ -111,9 +99,7 @@ class CamaraTarget(ServerTarget):
         It has no protocol and no direction: it treats what goes between a device's ports and a
         server's ports, both ways, UDP and TCP alike.
         """
-        profile = class_name(
-            rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
-        )
+        profile = class_name(rule, settings.qos_profiles, setting="qos_profiles")
         address = {"publicAddress": end.device, "privateAddress": end.device}
         device: Body = {"ipv4Address": address}
         if end.is_ipv6:
@@ -149,24 +135,17 @@ class CamaraTarget(ServerTarget):
             status=reply.status,
         )
 
-    def find(self, body: Body) -> Made | None:
-        """Look through the device's sessions for one that asks for the same."""
+    def look(self, id_: str, body: Body) -> Made | None:
+        """GET it, or all of the device; one that has ended differs, for it is deleted first."""
+        if id_:
+            reply = self._api.request("GET", self.path(id_), may_be_gone=True)
+            return None if reply.gone else self._made(reply.read(_Session), body)
         asked = {"device": body["device"]} if "device" in body else {}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
         for each in () if reply.gone else reply.read(tuple[_Session, ...]):
-            if not _differs(body, each, missing=True):
+            if not differs(body, each, _COMPARED, missing=True):
                 return self._made(each, body)
         return None
-
-    def see(self, id_: str, body: Body) -> Made | None:
-        """GET it; one that has ended counts as different, for it has to be deleted first."""
-        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        return None if reply.gone else self._made(reply.read(_Session), body)
-
-    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - ServerTarget
-        """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
-        self.delete(id_)
-        return self.create(body)
 
     def renew(self) -> float | None:
         """Prolong sessions that are due; return seconds until the next is.
@@ -174,21 +153,17 @@ class CamaraTarget(ServerTarget):
         Raises:
             PartlyError: something could not be prolonged and will expire or has expired.
         """
-        errors: list[tuple[str, LifecycleError]] = []
-        for entry in self._entries().values():
-            due_s = self._due_in_s(entry)
-            if not entry.id or due_s is None or due_s > 0:
-                continue
-            try:
-                made = self._prolonged(entry, json.loads(entry.body))
-            except LifecycleError as error:
-                errors.append((entry.key, error))
-            else:
-                self._note(replace(entry, id=made.id, expires_s=made.expires_s))
-        if errors:
+        now = [each for each in self._entries().values() if each.id and self._due_in_s(each) <= 0]
+        _, failed = each_done(now, self._prolong)
+        if failed:
+            errors = [(entry.key, error) for entry, error in failed]
             raise PartlyError(self.name, len(self._entries()), errors)
-        due = [self._due_in_s(each) for each in self._entries().values()]
-        return min((each for each in due if each is not None), default=None)
+        due_s = min(map(self._due_in_s, self._entries().values()), default=math.inf)
+        return None if due_s == math.inf else due_s
+
+    def _prolong(self, entry: Entry) -> None:
+        made = self._prolonged(entry, json.loads(entry.body))
+        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
 
     def _prolonged(self, entry: Entry, body: Body) -> Made:
         """Extend a session; make a new one where it cannot be extended any further."""
@@ -210,19 +185,13 @@ class CamaraTarget(ServerTarget):
                     return made
         return self.update(entry.id, body, body)
 
-    def _due_in_s(self, entry: Entry) -> float | None:
+    def _due_in_s(self, entry: Entry) -> float:
         """Return seconds until a session must be prolonged; negative once it is late."""
         if entry.expires_s is None:
-            return None
+            return math.inf
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
-        clock = self._api.clock
-        left_s, now_s = entry.expires_s - clock.now_s(), clock.steady_s()
-        # A clock that is set back meanwhile makes no session last longer.
-        known = self._expires.get(entry.key)
-        if known is None or known[0] != entry.expires_s:
-            known = self._expires[entry.key] = entry.expires_s, now_s + left_s
-        return min(left_s, known[1] - now_s) - margin_s
+        return entry.expires_s - self._api.clock.steady_s() - margin_s
 
     def _settled(self, session: _Session) -> _Session:
         """Ask until the session is more than requested, for a while."""
@@ -246,19 +215,15 @@ class CamaraTarget(ServerTarget):
         if granted is not None and granted < self._server.duration_s:
             detail = f"granted for {granted} s instead of {self._server.duration_s} s"
         # The latest that it can end, if nothing says when.
-        expires_s = None if granted is None else self._api.clock.now_s() + granted
+        left_s: float | None = granted
         if session.expires_at is not None:
-            expires_s = session.expires_at.timestamp()
-        return Made(id=id_, expires_s=expires_s, detail=detail, differs=_differs(body, session))
-
-
-def _differs(asked: Body, seen: _Session, *, missing: bool = False) -> str:
-    """Why what the server shows is not what was asked for; empty if it is."""
-    for key, field in _COMPARED.items():
-        found = getattr(seen, field)
-        if (found is not None or missing) and found != asked.get(key):
-            return f"the server has {key} {text_of(str(found))!r}"
-    return ""
+            left_s = session.expires_at.timestamp() - self._api.clock.now_s()
+        return Made(
+            id=id_,
+            expires_s=None if left_s is None else self._api.clock.steady_s() + left_s,
+            detail=detail,
+            differs=differs(body, session, _COMPARED),
+        )
 
 
 TARGET = CamaraTarget

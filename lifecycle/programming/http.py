@@ -11,7 +11,6 @@ from __future__ import annotations
 import email.utils
 import os
 import re
-import zlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 from urllib.parse import quote, unquote, urlsplit
@@ -20,34 +19,25 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.patience import Clock, Deadline, Patience
-from lifecycle.programming.settings import Token, readable
-from lifecycle.programming.target import HttpError, MissingFeatureError, SettingsError
+from lifecycle.programming.settings import ServerSettings, readable
+from lifecycle.programming.target import HttpError, Means, ProgrammingError, SettingsError
 
 try:
     import httpx
 except ModuleNotFoundError:  # an extra: most systems program no network that is reached over HTTP
     httpx = None  # type: ignore[assignment]
 
-MERGE_PATCH = "application/merge-patch+json"
-"""RFC 7396; what TS 29.122 wants of PATCH."""
-
 ID_PATTERN = r"^[!-~]{1,512}$"
 """The id of a subscription or a session; CAMARA's are UUIDs."""
 
-_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE", "PATCH"})
-"""RFC 9110 §9.2.2, and PATCH: a merge patch that is applied twice gives the same."""
+_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE"})
+"""RFC 9110 §9.2.2."""
 
 _ALWAYS_AGAIN = frozenset({409, 429, 503})
 _PASSING = frozenset({500, 502, 504})
 _MAX_QUOTED = 300
 _LARGEST_ANSWER = 4 * 1024 * 1024
-"""Bytes, unpacked: answers are a session or a subscription each, and a list of them all when one
-was lost."""
-
-_PACKED = {"gzip": 31, "x-gzip": 31, "deflate": 15}
-"""Content codings that are unpacked, though none is asked for, with zlib's name for each
-(RFC 9110 §8.4.1): one at most, as each multiplies the size by up to a thousand."""
+"""Bytes: answers are a session or a subscription each, and a list of them all when one was lost."""
 
 _T = TypeVar("_T")
 
@@ -133,39 +123,31 @@ class Api:
     """One server's interface.
 
     Args:
+        settings: where it is, its token, and how long one attempt may take, from looking the name
+            up to the last byte of the answer.
+        means: bound all requests together.
+
+    Attributes:
         url: what every path is appended to.
-        token: sent as a bearer token; None sends none.
-        timeout_s: of one attempt, from looking the name up to the last byte of the answer.
-        patience: see Patience.
         clock: see Clock.
-        deadline: bounds all requests together; None does not.
 
     Raises:
-        MissingFeatureError: httpx, the extra `networks`, is not installed.
+        ProgrammingError: httpx, the extra `networks`, is not installed.
         SettingsError: a proxy that the environment names cannot be used.
     """
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        token: Token | None = None,
-        timeout_s: float = 10.0,
-        patience: Patience | None = None,
-        clock: Clock | None = None,
-        deadline: Deadline | None = None,
-    ) -> None:
-        self.url = url.rstrip("/")
+    def __init__(self, settings: ServerSettings, means: Means) -> None:
+        self.url = settings.scope
         if httpx is None:
-            raise MissingFeatureError(
+            raise ProgrammingError(
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
-        self.clock = clock or Clock()
-        self._token = token
-        self._timeout_s = timeout_s
-        self._patience = patience or Patience()
-        self._deadline = deadline or Deadline()
+        self.clock = means.clock
+        self._token = settings.token
+        self._timeout_s = settings.timeout_s
+        self._patience = means.patience
+        self._deadline = means.deadline
         self._certificates = httpx.create_ssl_context()
         self._client()  # so that a proxy that cannot be used is an error at once
 
@@ -205,7 +187,6 @@ class Api:
         path: str,
         body: Mapping[str, object] | None = None,
         *,
-        content_type: str = "application/json",
         may_be_gone: bool = False,
     ) -> Reply:
         """Ask, and ask again where that is right; always back by the deadline.
@@ -218,7 +199,6 @@ class Api:
             method: HTTP method.
             path: below `url`; starts with a slash.
             body: sent as JSON.
-            content_type: of the body.
             may_be_gone: 404 and 410 are answers, not errors.
 
         Raises:
@@ -230,47 +210,36 @@ class Api:
             "accept-encoding": "identity",
         }
         if body is not None:
-            headers["content-type"] = content_type
+            headers["content-type"] = "application/json"
         content = None if body is None else to_json(body)
         request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
-        wait_s = self._patience.first_s
+        wait_s, attempt = self._patience.first_s, 1
         with self._deadline.within(self._patience.total_s):
-            for attempt in range(1, self._patience.attempts + 1):
-                asked_s = None
+            while True:
                 try:
-                    reply = self._attempt(request)
+                    return self._attempt(request, may_be_gone=may_be_gone)
                 except HttpError as error:
-                    failed, again = error, method in _IDEMPOTENT or not error.uncertain
-                else:
-                    if reply.is_success or (may_be_gone and reply.gone):
-                        return reply
-                    lost, twice = reply.status in _PASSING, method in _IDEMPOTENT
-                    failed = self._refusal(reply, uncertain=lost and not twice)
-                    again = reply.status in _ALWAYS_AGAIN or (lost and twice)
-                    asked_s = _retry_after_s(
-                        reply.headers.get("retry-after", ""), self.clock.now_s()
-                    )
-                pause_s = min(wait_s, self._patience.longest_s) if asked_s is None else asked_s
-                left_s = self._deadline.left_s()
-                if not again or attempt == self._patience.attempts:
-                    break
-                if pause_s >= left_s:
-                    # What has failed says more than that there is no time to try again.
-                    if asked_s is not None:
-                        failed.hint = (
-                            f"the server asks to wait {asked_s:g} s, more than the {left_s:.0f} s "
-                            "that this waits for; try again then"
-                        )
-                    break
+                    pause_s = min(wait_s, self._patience.longest_s)
+                    pause_s = pause_s if error.after_s is None else error.after_s
+                    left_s = self._deadline.left_s()
+                    if not error.again or attempt == self._patience.attempts:
+                        raise
+                    if pause_s >= left_s:
+                        # What has failed says more than that there is no time to try again.
+                        if error.after_s is not None:
+                            error.hint = (
+                                f"the server asks to wait {pause_s:g} s, more than the "
+                                f"{left_s:.0f} s that this waits for; try again then"
+                            )
+                        raise
                 self.pause(pause_s)
-                wait_s *= 2
-        raise failed
+                wait_s, attempt = wait_s * 2, attempt + 1
 
-    def _attempt(self, request: httpx.Request) -> Reply:
+    def _attempt(self, request: httpx.Request, *, may_be_gone: bool) -> Reply:
         """Ask once.
 
         Raises:
-            HttpError: there is no answer that can be read; `uncertain` if it was sent.
+            HttpError: refused, or there is no answer that can be read; says whether to ask again.
         """
         what = f"{request.method} {request.url}"
         limit_s = min(self._timeout_s, self._deadline.left_s())
@@ -288,7 +257,7 @@ class Api:
         if self._token is not None:
             request.headers["authorization"] = f"Bearer {self._token.reveal()}"
         try:
-            return self._deadline.run(self._ask(request), limit_s)
+            reply = self._deadline.run(self._ask(request), limit_s)
         except TimeoutError:
             reason = f"no {'whole answer' if sent else 'connection'} in time"
             if self._deadline.cancelled.is_set():
@@ -299,27 +268,28 @@ class Api:
         except Exception as error:  # noqa: BLE001 - whatever a library makes of unexpected bytes
             # Never its own message, which may quote the request.
             reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
-        raise HttpError(f"cannot {what}: {reason}", uncertain=sent)
+        else:
+            if reply.is_success or (may_be_gone and reply.gone):
+                return reply
+            raise self._refusal(reply, request.method)
+        again = request.method in _IDEMPOTENT or not sent
+        raise HttpError(f"cannot {what}: {reason}", uncertain=sent, again=again)
 
     async def _ask(self, request: httpx.Request) -> Reply:
         """Send a request and read its answer, of which no more than can be of use.
 
         Raises:
-            httpx.HTTPError: there is none.
-            zlib.error: it is not packed as it says.
+            httpx.HTTPError: there is none, or it is packed.
         """
         body = bytearray()
         async with self._client() as client:
             answer = await client.send(request, stream=True)
             try:
-                coding = answer.headers.get("content-encoding", "identity").strip().lower()
-                if coding not in ("", "identity", *_PACKED):
-                    raise httpx.DecodingError(f"packed as {coding!r}")
-                unpacking = zlib.decompressobj(_PACKED[coding]) if coding in _PACKED else None
-                # Not aiter_bytes, which unpacks all that arrives at once: 64 kB may be 64 MB.
+                coding = answer.headers.get("content-encoding", "identity")
+                if coding.strip().lower() not in ("", "identity"):
+                    raise httpx.RemoteProtocolError("it is packed, which was not asked for")
                 async for chunk in answer.aiter_raw():
-                    left = _LARGEST_ANSWER + 1 - len(body)
-                    body += unpacking.decompress(chunk, left) if unpacking else chunk
+                    body += chunk
                     if len(body) > _LARGEST_ANSWER:
                         break
             finally:
@@ -336,7 +306,7 @@ class Api:
         ended = self._deadline.cancelled.is_set()
         return "it was ended before it was done" if ended else "no time left"
 
-    def _refusal(self, answer: Reply, *, uncertain: bool) -> HttpError:
+    def _refusal(self, answer: Reply, method: str) -> HttpError:
         try:
             found = from_json(answer.body, _Problem, longest=_LARGEST_ANSWER)
         except ValueError:
@@ -352,11 +322,14 @@ class Api:
             first(found.cause, found.code),
             first(found.detail, found.message, found.title),
         ]
+        lost, twice = answer.status in _PASSING, method in _IDEMPOTENT
         forbidden = answer.status in (401, 403)
         return HttpError(
             f"cannot {answer.asked}: {': '.join(filter(None, words))}",
             status=answer.status,
-            uncertain=uncertain,
+            uncertain=lost and not twice,
+            again=answer.status in _ALWAYS_AGAIN or (lost and twice),
+            after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.clock.now_s()),
             hint="check the token and what it is allowed to do" if forbidden else "",
         )
 

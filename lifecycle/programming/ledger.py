@@ -1,9 +1,8 @@
 """The ledger: what this package made in networks, written down before and after it is made.
 
 Owns: the file `programmed.json` in a run directory. It outlives the process, so that a removal
-deletes only what is ours, and the next run finds what a dead one left. Of tables and devices of
-this host it has the names only: what they hold is marked there. Of servers it has the body of each
-request, before it is sent, and the id that the server gave it; never a credential.
+deletes only what is ours, and the next run finds what a dead one left. It has what each flow was
+given, and of servers the id of what was made; never a credential.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +17,6 @@ from pathlib import Path
 import msgspec
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import UsageError
 from lifecycle.programming.target import ProgrammingError
 from lifecycle.run_directory import (
     LEDGER_LOCK_NAME,
@@ -27,6 +24,7 @@ from lifecycle.run_directory import (
     ChildRecord,
     boot_id,
     is_process,
+    private_directory,
     start_ticks,
 )
 
@@ -38,15 +36,15 @@ _LOCK_CHECK_S = 0.05
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing of ours at a server, for one flow.
+    """One thing of ours in a network, for one flow.
 
     Attributes:
         key: of its FlowRule.
-        id: what the server calls it, a subscription or a session; empty while it was asked for and
+        id: what a server calls it, a subscription or a session; empty while it was asked for and
             is not known to be made.
         what: for people.
-        expires_s: seconds since the epoch; None if it does not expire.
-        body: what was asked for, as JSON; what finds it again while its id is not known.
+        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
+        body: what was written or asked for, of servers as JSON: it finds again what has no id yet.
     """
 
     key: str
@@ -63,12 +61,17 @@ class TargetRecord(msgspec.Struct, frozen=True, kw_only=True):
         target: "nft", "tc", "nef" or "camara".
         scope: which one of that kind: a table, a device, a URL.
         settings: path of the settings file that says how to get there; empty if none is needed.
+        entries: nothing of ours is there without any.
+        found: digest of a host's table as it was after writing; empty while it is written.
+        beside: digest of what was made beside that table.
     """
 
     target: str
     scope: str
     settings: str = ""
     entries: tuple[Entry, ...] = ()
+    found: str = ""
+    beside: str = ""
 
     @property
     def network(self) -> tuple[str, str]:
@@ -113,16 +116,18 @@ class Ledger:
 
         Raises:
             ProgrammingError: another process keeps it for too long.
+            UsageError: others can write where it is kept.
         """
+        # What others can write would make us delete what is not ours.
         for each in (self._directory.parent, self._directory):
-            _own_directory(each)
-        lock = os.open(
-            self._directory / LEDGER_LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
-        )
-        try:
-            deadline = time.monotonic() + _LOCK_S
-            while not _locks(lock):
-                if time.monotonic() > deadline:
+            private_directory(each)
+        with (self._directory / LEDGER_LOCK_NAME).open("w") as lock:
+            until_s = time.monotonic() + _LOCK_S
+            while True:
+                with contextlib.suppress(BlockingIOError):
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                if time.monotonic() > until_s:
                     raise ProgrammingError(
                         f"cannot program the flows of {self.system!r}: another process has been "
                         f"doing so for {_LOCK_S:g} s",
@@ -130,8 +135,6 @@ class Ledger:
                     )
                 time.sleep(_LOCK_CHECK_S)
             yield
-        finally:
-            os.close(lock)
 
     def read(self) -> LedgerFile:
         """Return what is written.
@@ -151,28 +154,21 @@ class Ledger:
                 hint="look at what it lists, remove that by hand, then delete the file",
             ) from error
 
-    def has(self, record: TargetRecord) -> bool:
-        """Whether anything of ours is written of the network of a record."""
-        return any(each.network == record.network for each in self.read().targets)
-
-    def entries(self, record: TargetRecord) -> tuple[Entry, ...]:
-        """Return what is written of the network of a record."""
-        found = (each.entries for each in self.read().targets if each.network == record.network)
-        return next(found, ())
+    def find(self, record: TargetRecord) -> TargetRecord | None:
+        """Return what is written of the network of a record; None if nothing is."""
+        found = (each for each in self.read().targets if each.network == record.network)
+        return next(found, None)
 
     def put(self, record: TargetRecord) -> None:
-        """Write down what is ours in one network, in place of what was written of it."""
-        self._write(record, record)
+        """Write down what is ours in one network, in place of what was written of it.
 
-    def drop(self, record: TargetRecord) -> None:
-        """Nothing of ours is left in the network of a record."""
-        if self.has(record):
-            self._write(record)
-
-    def _write(self, of: TargetRecord, *instead: TargetRecord) -> None:
+        Raises:
+            ProgrammingError: it cannot be read or written.
+        """
         before = self.read()
-        others = [each for each in before.targets if each.network != of.network]
-        targets = (*others, *instead)
+        targets = [each for each in before.targets if each.network != record.network]
+        if record.entries:
+            targets.append(record)
         if not targets:
             self._path.unlink(missing_ok=True)
             return
@@ -183,7 +179,7 @@ class Ledger:
             owner = ChildRecord(name="supervisor", pid=pid, start_ticks=start_ticks(pid) or 0)
         part = self._path.with_name(f".{LEDGER_NAME}")
         text = to_json(
-            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
+            LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=tuple(targets))
         )
         try:
             with part.open("wb") as file:
@@ -209,24 +205,3 @@ def owner_is_dead(file: LedgerFile) -> bool:
     if file.owner is None:
         return False
     return file.boot_id != boot_id() or not is_process(file.owner.pid, file.owner.start_ticks)
-
-
-def _own_directory(path: Path) -> None:
-    """Make `path` if need be; what others can write would make us delete what is not ours."""
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    status = path.lstat()
-    others = stat.S_IWGRP | stat.S_IWOTH
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & others:
-        raise UsageError(
-            f"cannot keep a ledger in {str(path)!r}: it must be a directory of this user that "
-            "others cannot write",
-            hint="remove it, or set XDG_RUNTIME_DIR",
-        )
-
-
-def _locks(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

@@ -13,27 +13,20 @@ import re
 from collections.abc import Iterable
 
 import msgspec
+from msgspec import to_builtins
+from msgspec.structs import replace
 
-from lifecycle.programming.http import MERGE_PATCH, Reply, as_segment, text_of
+from lifecycle.programming.http import Reply, as_segment, text_of
 from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
-from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 from lifecycle.programming.settings import ServerSettings
-from lifecycle.programming.target import HttpError
 
-_PATCHABLE = ("notificationDestination", "flowInfo", "qosReference")
-"""What AsSessionWithQoSSubscriptionPatch may hold; a device's address is not among it."""
+_FIXED = ("ueIpv4Addr", "ueIpv6Addr")
+"""What no PUT may change: another device needs another subscription."""
 
-_COMPARED = {
-    "ueIpv4Addr": "ue_ipv4_addr",
-    "ueIpv6Addr": "ue_ipv6_addr",
-    "qosReference": "qos_reference",
-    "notificationDestination": "notification_destination",
-}
+_COMPARED = (*_FIXED, "qosReference", "notificationDestination", "flowInfo")
 
 _PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
-
-_NO_PATCH = (404, 405, 415, 501)
-"""Statuses of servers without PATCH."""
 
 
 class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,14 +37,12 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
         scs_as_id: who we are to the operator.
         notification_destination: http or https URL that the network reports to.
         qos_references: the operator's names of classes, by 5QI.
-        default_qos_reference: for flows whose 5QI is not named; empty leaves them out.
         protocol_by_name: write `udp` instead of `17`, as some servers want it.
     """
 
     scs_as_id: str
     notification_destination: str
     qos_references: dict[int, str] = msgspec.field(default_factory=dict)
-    default_qos_reference: str = ""
     protocol_by_name: bool = False
 
     def __post_init__(self) -> None:
@@ -82,13 +73,22 @@ def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
     return f"permit out {protocol} from {server} to {device}"
 
 
+def _spelled(text: str) -> str:
+    """A filter in one spelling: servers write `17` and `udp`, and other spaces."""
+    words = [_PROTOCOLS.get(each.lower(), each) for each in text.split()]
+    for index, each in enumerate(words):
+        with contextlib.suppress(ValueError):
+            words[index] = str(ipaddress.ip_address(each))
+    return " ".join(words)
+
+
 class _Flow(msgspec.Struct, frozen=True, rename="camel"):
     """FlowInfo of TS 29.122 §5.2.1.2.14, as far as it is read."""
 
     flow_descriptions: tuple[str, ...] = ()
 
 
-class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """What a server shows of a subscription; None is not shown."""
 
     link: str | None = msgspec.field(default=None, name="self")
@@ -113,9 +113,7 @@ class NefTarget(ServerTarget):
 
         One flow each: a known open implementation passes on only the last of several.
         """
-        reference = class_name(
-            rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
-        )
+        reference = class_name(rule, settings.qos_references, setting="qos_references")
         return {
             "supportedFeatures": "0",  # hexadecimal, TS 29.571: none
             "notificationDestination": settings.notification_destination,
@@ -137,32 +135,24 @@ class NefTarget(ServerTarget):
             raise reply.unusable("it has neither a Location nor a self")
         return Made(id=reply.linked(made), detail=_refused(shown))
 
-    def find(self, body: Body) -> Made | None:
-        """Look through our subscriptions for one that asks for the same."""
-        reply = self._api.request("GET", self.collection, may_be_gone=True)
-        for each in () if reply.gone else reply.read(tuple[_Subscription, ...]):
+    def look(self, id_: str, body: Body) -> Made | None:
+        """GET it, or all of ours."""
+        path = self.path(id_) if id_ else self.collection
+        reply = self._api.request("GET", path, may_be_gone=True)
+        if reply.gone:
+            return None
+        if id_:
+            return Made(id=id_, differs=_differs(body, _shown(reply)))
+        for each in reply.read(tuple[_Subscription, ...]):
             if each.link and not _differs(body, each, missing=True):
                 return Made(id=reply.linked(each.link))
         return None
 
-    def see(self, id_: str, body: Body) -> Made | None:
-        """GET it."""
-        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        return None if reply.gone else Made(id=id_, differs=_differs(body, _shown(reply)))
-
     def update(self, id_: str, before: Body, body: Body) -> Made:
-        """PATCH what may be patched, PUT where there is no PATCH; else delete and create."""
-        fixed = {key for key in {*before, *body} if before.get(key) != body.get(key)}
-        if fixed - {*_PATCHABLE}:
-            self.delete(id_)
-            return self.create(body)
-        patch = {key: body[key] for key in _PATCHABLE if key in body}
-        try:
-            reply = self._api.request("PATCH", self.path(id_), patch, content_type=MERGE_PATCH)
-        except HttpError as error:
-            if error.status not in _NO_PATCH:
-                raise
-            reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
+        """PUT it, so that what the network has reserved for a flow stays reserved."""
+        if any(before.get(key) != body.get(key) for key in _FIXED):
+            return super().update(id_, before, body)
+        reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
         if reply.gone:
             return self.create(body)
         return Made(id=id_, detail=_refused(_shown(reply)))
@@ -184,35 +174,17 @@ def _refused(subscription: _Subscription) -> str:
 
 
 def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
-    """Why what the server shows is not what was asked for; empty if it is.
-
-    Args:
-        asked: our body.
-        seen: the server's; it may add to it.
-        missing: something that the server does not show differs too.
-    """
-    for key, field in _COMPARED.items():
-        found = getattr(seen, field)
-        if (found is not None or missing) and found != asked.get(key):
-            return f"the server has {key} {text_of(found)!r}"
-    wanted = _filters(text for flow in asked["flowInfo"] for text in flow["flowDescriptions"])
-    shown = _filters(text for flow in seen.flow_info or () for text in flow.flow_descriptions)
-    if (seen.flow_info is not None or missing) and shown != wanted:
-        return "the server has other filters"
-    return ""
+    wanted, shown = (
+        each
+        if each.flow_info is None
+        else replace(each, flow_info=_in_one_spelling(each.flow_info))
+        for each in (msgspec.convert(asked, _Subscription), seen)
+    )
+    return differs(to_builtins(wanted), shown, _COMPARED, missing=missing)
 
 
-def _filters(texts: Iterable[str]) -> list[str]:
-    """The filters in one spelling: servers write `17` and `udp`, and other spaces."""
-    return sorted(map(_spelled, texts))
-
-
-def _spelled(text: str) -> str:
-    words = [_PROTOCOLS.get(each.lower(), each) for each in text.split()]
-    for index, each in enumerate(words):
-        with contextlib.suppress(ValueError):
-            words[index] = str(ipaddress.ip_address(each))
-    return " ".join(words)
+def _in_one_spelling(flows: Iterable[_Flow]) -> tuple[_Flow, ...]:
+    return tuple(_Flow(tuple(sorted(map(_spelled, each.flow_descriptions)))) for each in flows)
 
 
 TARGET = NefTarget

@@ -29,8 +29,8 @@ class Clock:
         return time.time()
 
     def steady_s(self) -> float:
-        """Return seconds, on a clock that only goes forward."""
-        return time.monotonic()
+        """Return seconds since the host was started, on a clock that only goes forward."""
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
 
     def sleep(self, seconds: float, woken: threading.Event) -> None:
         """Wait, or until `woken` is set."""

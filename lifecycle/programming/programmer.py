@@ -13,23 +13,23 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
-import msgspec
 import psutil
 
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
+from lifecycle.network.five_qi import dscp_mapping, parse_mapping
 from lifecycle.network.nfe import canonical, is_loopback
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
-from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, flow_rules
+from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, Treatment, flow_rules
 from lifecycle.programming.target import (
     Chosen,
     Means,
     PartlyError,
+    T,
     Target,
     TargetChanges,
+    each_done,
     target_kind,
 )
 from lifecycle.run_directory import is_held, run_name, runtime_root
@@ -38,18 +38,6 @@ from lifecycle.verify.verdict import FlowReport
 
 _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""
-
-
-class Treatment(msgspec.Struct, frozen=True, kw_only=True):
-    """What flows get beyond what the manifest says.
-
-    Attributes:
-        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
-        label_flows: each IPv6 flow gets a flow label of its own.
-    """
-
-    mapping: DscpMapping | None = None
-    label_flows: bool = False
 
 
 def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
@@ -72,8 +60,8 @@ def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
     return Treatment(mapping=found, label_flows=label_flows)
 
 
-class RouteSources:
-    """Observes source addresses, see rules.SourceAddress.
+def route_sources(plan: Plan, machine: str = "") -> SourceAddress:
+    """Return what observes source addresses, see rules.SourceAddress.
 
     A publisher's socket is bound to `0.0.0.0`, so the source address of its packets is known only
     by the route they take. For publishers on other machines this host cannot know it.
@@ -82,29 +70,27 @@ class RouteSources:
         plan: says which machine a node is on.
         machine: the machine that this host is; empty to determine it by its addresses.
     """
+    own = {
+        canonical(each.address.partition("%")[0])
+        for addresses in psutil.net_if_addrs().values()
+        for each in addresses
+        if each.family in (socket.AF_INET, socket.AF_INET6)
+    }
+    elsewhere = {
+        each.name
+        for each in plan.machines
+        if each.name != machine and each.address and canonical(each.address) not in own
+    }
 
-    def __init__(self, plan: Plan, machine: str = "") -> None:
-        own = {
-            canonical(each.address.partition("%")[0])
-            for addresses in psutil.net_if_addrs().values()
-            for each in addresses
-            if each.family in (socket.AF_INET, socket.AF_INET6)
-        }
-        self._local = {
-            each.name
-            for each in plan.machines
-            if each.name == machine or not each.address or canonical(each.address) in own
-        }
-        self._machines = {each.name for each in plan.machines}
-
-    def __call__(self, node: PlannedNode, destination: str) -> str:
-        """Return the address; empty for a node of another machine, or if there is no route."""
-        if node.machine in self._machines and node.machine not in self._local:
+    def observe(node: PlannedNode, destination: str) -> str:
+        if node.machine in elsewhere:
             return ""
         if is_loopback(destination):
             # A packet to loopback comes from loopback, whatever the routing says.
             return canonical(destination)
         return route_source(destination)
+
+    return observe
 
 
 def route_source(destination: str) -> str:
@@ -194,23 +180,24 @@ class Programmer(Removal):
 
     def rules(self, flows: Iterable[FlowReport]) -> RuleSet:
         """Return what may be programmed of these flows, and what may not."""
-        return flow_rules(
+        found = flow_rules(
             flows,
             self._plan,
             source_address=self._source_address,
-            mapping=self._treatment.mapping,
-            label_flows=self._treatment.label_flows,
+            treatment=self._treatment,
         )
+        self.left_out = found.left_out
+        return found
 
     def diff(self, flows: Iterable[FlowReport]) -> tuple[TargetChanges, ...]:
         """Return what `update` would do; changes no network."""
-        rules = self._take(flows)
+        rules = self.rules(flows).rules
         with self._ledger.locked():
             return tuple(each.plan(rules) for each in self._targets)
 
     def dry_run(self, flows: Iterable[FlowReport]) -> str:
-        """Return what `update` would send if nothing were there, checked where that is possible."""
-        rules = self._take(flows)
+        """Return what `update` would send if nothing were there."""
+        rules = self.rules(flows).rules
         return "\n".join(each.dry_run(rules) for each in self._targets)
 
     def update(
@@ -236,7 +223,7 @@ class Programmer(Removal):
             PartlyError: one target or several could not be brought up to date; others are.
         """
         reports = tuple(flows)
-        rules = self._take(reports)
+        rules = self.rules(reports).rules
         if hold:
             rules = _with_held(rules, self._programmed.values(), reports)
         if rules == self._applied:
@@ -273,11 +260,6 @@ class Programmer(Removal):
         self._applied, self._programmed = None, {}
         return super().close(within_s=within_s)
 
-    def _take(self, flows: Iterable[FlowReport]) -> tuple[FlowRule, ...]:
-        found = self.rules(flows)
-        self.left_out = found.left_out
-        return found.rules
-
 
 def open_programmer(
     plan: Plan,
@@ -307,7 +289,7 @@ def open_programmer(
         plan,
         [each.open(means) for each in chosen],
         means,
-        source_address=RouteSources(plan, machine),
+        source_address=route_sources(plan, machine),
         treatment=treatment,
     )
 
@@ -369,26 +351,15 @@ def _with_held(
     return tuple(sorted((*rules, *held), key=lambda each: each.key))
 
 
-_T = TypeVar("_T")
-
-
-def _each(things: Iterable[_T], do: Callable[[_T], TargetChanges]) -> tuple[TargetChanges, ...]:
-    """Do it to each, whatever becomes of the others."""
-    every = tuple(things)
-    done: list[TargetChanges] = []
-    errors: list[LifecycleError] = []
-    for each in every:
-        try:
-            done.append(do(each))
-        except LifecycleError as error:  # noqa: PERF203 - the other targets go on
-            errors.append(error)
-    if len(errors) == len(every) == 1:
-        raise errors[0]
-    if errors:
+def _each(things: Iterable[T], do: Callable[[T], TargetChanges]) -> tuple[TargetChanges, ...]:
+    done, failed = each_done(things, do)
+    if len(failed) == 1 and not done:
+        raise failed[0][1]
+    if failed:
         raise PartlyError(
             "targets",
-            len(every),
-            [("", error) for error in errors],
+            len(done) + len(failed),
+            [("", error) for _, error in failed],
             done=[each.render(done=True) for each in done if each.changes],
         )
     return tuple(done)

@@ -1,6 +1,6 @@
 """Turns verified flows into flow rules for networks, with the reason for each flow left out.
 
-Owns: `FlowRule`, the step from flow reports to rules, and how a rule reads in comments. A
+Owns: `FlowRule`, the step from flow reports to rules, and how a rule reads. A
 rule says only what was observed or declared: a flow whose verdict is not ok, shared memory, groups
 and tuples that two flows share in disagreement make no rule, and each is listed with its reason.
 Comments have DSCP and TOS always side by side, because products differ in which of the two they ask
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -39,6 +40,8 @@ from lifecycle.verify.verdict import FlowReport
 
 PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
 """The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""
+
+T = TypeVar("T")
 
 MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""
@@ -161,13 +164,17 @@ class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
     left_out: tuple[str, ...] = ()
 
 
-class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
-    """One tuple of one pair; `ask` is (DSCP, 5QI), both None where nothing is asked."""
+class Treatment(msgspec.Struct, frozen=True, kw_only=True):
+    """What flows get beyond what the manifest says.
 
-    report: FlowReport
-    flow: FlowTuple
-    source_address: str
-    ask: tuple[int | None, int | None]
+    Attributes:
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
+        label_flows: each IPv6 flow gets a flow label of its own, so that the 3-tuple of addresses
+            and label distinguishes it from others too.
+    """
+
+    mapping: DscpMapping | None = None
+    label_flows: bool = False
 
 
 def flow_rules(
@@ -175,8 +182,7 @@ def flow_rules(
     plan: Plan,
     *,
     source_address: SourceAddress | None = None,
-    mapping: DscpMapping | None = None,
-    label_flows: bool = False,
+    treatment: Treatment | None = None,
 ) -> RuleSet:
     """Turn verified flows into rules.
 
@@ -192,81 +198,81 @@ def flow_rules(
         flows: as `verify` reports them.
         plan: that they were judged against.
         source_address: see SourceAddress; None if nothing was observed.
-        mapping: gives the DSCP of flows that have a 5QI and no DSCP.
-        label_flows: give each IPv6 flow a flow label of its own, so that the 3-tuple of addresses
-            and label distinguishes it from others too.
+        treatment: what flows get beyond what the manifest says.
     """
     left_out: list[str] = []
-    by_tuple: dict[tuple[object, ...], list[_Candidate]] = {}
+    by_tuple: dict[str, list[FlowRule]] = {}
     for report in flows:
-        for each in _candidates(report, plan, source_address, left_out):
-            flow = each.flow
-            place = (
-                flow.transport_protocol,
-                each.source_address,
-                flow.source_port,
-                flow.destination_address,
-                flow.destination_port,
-            )
-            by_tuple.setdefault(place, []).append(each)
+        for rule in _rules_of(report, plan, source_address, left_out):
+            by_tuple.setdefault(rule.describe(), []).append(rule)
     rules: list[FlowRule] = []
     for sharing in by_tuple.values():
-        asks = {each.ask for each in sharing}
-        if asks == {(None, None)}:
-            left_out += [_left(each.report, "neither a dscp nor a five_qi") for each in sharing]
-        elif len(asks) > 1:
+        asked = {(each.dscp, each.five_qi) for each in sharing}
+        if asked == {(None, None)}:
+            for each in sharing:
+                left_out += each.left_out("neither a dscp nor a five_qi")
+        elif len(asked) > 1:
             left_out += _disagreement(sharing)
         else:
-            try:
-                rules.append(_treated(_rule(sharing), mapping, label_flows=label_flows))
-            except ValueError as error:
-                left_out += [_left(each.report, str(error)) for each in sharing]
+            rules.append(_treated(_merged(sharing), treatment or Treatment()))
     return RuleSet(rules=_distinct(rules), left_out=tuple(dict.fromkeys(left_out)))
 
 
-def _candidates(
+def _rules_of(
     report: FlowReport,
     plan: Plan,
     source_address: SourceAddress | None,
     left_out: list[str],
-) -> Iterator[_Candidate]:
+) -> Iterator[FlowRule]:
+    """One rule for each tuple of one pair."""
+    names = (report.topic, report.publisher, report.subscription)
+
+    def leave_out(reason: str) -> None:
+        left_out.append(f"{_pair(*names)}: {reason}")
+
     if report.outcome is not Outcome.OK:
-        left_out.append(_left(report, f"not verified: its verdict is {report.outcome.value}"))
-        return
+        return leave_out(f"not verified: its verdict is {report.outcome.value}")
     if not report.source or not report.destination:
-        left_out.append(_left(report, "its network flow endpoints are not known"))
-        return
+        return leave_out("its network flow endpoints are not known")
     if report.effective_transport in _UNSEEN:
-        left_out.append(_left(report, _UNSEEN[report.effective_transport]))
-        return
+        return leave_out(_UNSEEN[report.effective_transport])
     unknown = report.effective_transport == UNKNOWN
     if unknown and not all(map(is_ip, (*report.source, *report.destination))):
-        left_out.append(_left(report, _UNSEEN[Medium.SHM]))
+        leave_out(_UNSEEN[Medium.SHM])
+    if not report.tuples and not unknown:
+        leave_out("its two ends have no IP transport in common")
     publisher = _node(plan, report.publisher)
     subscription = _node(plan, report.subscription)
     remote = publisher is None or subscription is None or not _same_host(plan, report)
-    ask = _ask(report, publisher, subscription)
-    if not report.tuples and not unknown:
-        left_out.append(_left(report, "its two ends have no IP transport in common"))
+    dscp, five_qi = _ask(report, publisher, subscription)
     for each in report.tuples:
         # A zone (`fe80::1%eth0`) names an interface of its own host and is not in the packet.
-        flow = replace(
-            each,
-            source_address=each.source_address.partition("%")[0],
-            destination_address=each.destination_address.partition("%")[0],
+        sender, to = (
+            address.partition("%")[0] for address in (each.source_address, each.destination_address)
         )
-        if is_multicast(flow.destination_address):
-            group = flow.destination_address
-            left_out.append(_left(report, f"group {group}: no unicast 5-tuple"))
-        elif is_loopback(flow.destination_address) and remote:
-            left_out.append(_left(report, "loopback: never leaves the subscription's machine"))
-        else:
-            yield _Candidate(
-                report=report,
-                flow=flow,
+        flow = replace(each, source_address=sender, destination_address=to)
+        if is_multicast(to):
+            leave_out(f"group {to}: no unicast 5-tuple")
+            continue
+        if is_loopback(to) and remote:
+            leave_out("loopback: never leaves the subscription's machine")
+            continue
+        try:
+            yield FlowRule(
+                key=f"{_pair(*names)} {flow.transport_protocol.value} {to}",
+                names=(names,),
+                transport_protocol=flow.transport_protocol,
                 source_address=_source(flow, plan, publisher, subscription, source_address),
-                ask=ask,
+                source_port=flow.source_port,
+                destination_address=to,
+                destination_port=flow.destination_port,
+                flow_label=flow.flow_label,
+                dscp=dscp,
+                five_qi=five_qi,
+                max_delay_ms=report.max_delay_ms,
             )
+        except ValueError as error:
+            leave_out(str(error))
 
 
 def _source(
@@ -304,36 +310,20 @@ def _ask(
     return dscp, next((each for each in asked if each is not None), None)
 
 
-def _rule(sharing: Sequence[_Candidate]) -> FlowRule:
-    first = sharing[0]
-    flow = first.flow
-    names = sorted(
-        {(each.report.topic, each.report.publisher, each.report.subscription) for each in sharing}
-    )
-    topic, publisher, subscription = names[0]
-    where = f"{flow.transport_protocol.value} {flow.destination_address}"
-    return FlowRule(
-        key=f"{topic} {publisher} → {subscription} {where}",
-        names=tuple(names),
-        transport_protocol=flow.transport_protocol,
-        source_address=first.source_address,
-        source_port=flow.source_port,
-        destination_address=flow.destination_address,
-        destination_port=flow.destination_port,
-        flow_label=flow.flow_label,
-        dscp=first.ask[0],
-        five_qi=first.ask[1],
-        max_delay_ms=min(
-            (ms for each in sharing if (ms := each.report.max_delay_ms) is not None), default=None
-        ),
-    )
+def _merged(sharing: Sequence[FlowRule]) -> FlowRule:
+    """One rule for pairs that one flow carries; it is called after the first of them by name."""
+    first = min(sharing, key=lambda each: each.names)
+    delays = [each.max_delay_ms for each in sharing if each.max_delay_ms is not None]
+    names = sorted({name for each in sharing for name in each.names})
+    return replace(first, names=tuple(names), max_delay_ms=min(delays, default=None))
 
 
-def _treated(rule: FlowRule, mapping: DscpMapping | None, *, label_flows: bool) -> FlowRule:
+def _treated(rule: FlowRule, treatment: Treatment) -> FlowRule:
     """The rule with what follows from its 5QI and its 5-tuple."""
+    mapping, is_ipv6 = treatment.mapping, rule.internet_protocol is InternetProtocol.IPV6
     if mapping is not None and rule.dscp is None and rule.five_qi is not None:
         rule = replace(rule, dscp=mapping.dscp_for(rule.five_qi))
-    if label_flows and rule.internet_protocol is InternetProtocol.IPV6 and not rule.flow_label:
+    if treatment.label_flows and is_ipv6 and not rule.flow_label:
         # Equal for equal 5-tuples and evenly spread, as RFC 6437 §3 asks; never 0, which is none.
         digest = hashlib.sha256(rule.describe().encode()).digest()
         label = 1 + int.from_bytes(digest[:8], "big") % MAX_FLOW_LABEL
@@ -352,20 +342,15 @@ def _distinct(rules: Sequence[FlowRule]) -> tuple[FlowRule, ...]:
     return tuple(distinct)
 
 
-def _disagreement(sharing: Sequence[_Candidate]) -> Iterator[str]:
+def _disagreement(sharing: Sequence[FlowRule]) -> Iterator[str]:
     """Two flows in one tuple that are to be treated differently: the network sees only one."""
     for each in sharing:
-        other = next(candidate for candidate in sharing if candidate.ask != each.ask)
-        yield _left(
-            each.report,
-            f"shares its 5-tuple with {other.report.topic} {other.report.publisher} → "
-            f"{other.report.subscription}, which is to be treated differently; "
-            "make one of them unique",
+        asked = (each.dscp, each.five_qi)
+        other = next(other for other in sharing if (other.dscp, other.five_qi) != asked)
+        yield from each.left_out(
+            f"shares its 5-tuple with {named(other)}, which is to be treated differently; "
+            "make one of them unique"
         )
-
-
-def _left(report: FlowReport, reason: str) -> str:
-    return f"{_pair(report.topic, report.publisher, report.subscription)}: {reason}"
 
 
 def _pair(topic: str, publisher: str, subscription: str) -> str:
@@ -418,20 +403,20 @@ def asks(rule: FlowRule) -> str:
     return ", ".join(found) or "nothing"
 
 
-def remarks(
-    rules: Sequence[FlowRule], left_out: Iterable[str], why_not: Callable[[FlowRule], str]
-) -> Iterator[str]:
-    """Return comment lines that say what an export has: its rules, and what is left out, and why.
+def expressed(
+    rules: Iterable[FlowRule], make: Callable[[FlowRule], T]
+) -> tuple[list[tuple[FlowRule, T]], tuple[str, ...]]:
+    """Return each rule with what a network makes of it, and the flows that it cannot express.
 
     Args:
         rules: of verified flows.
-        left_out: flows without a rule.
-        why_not: why a rule is not expressed; empty if it is.
+        make: raises a ValueError with the reason where a rule cannot be expressed.
     """
+    made: list[tuple[FlowRule, T]] = []
+    left_out: list[str] = []
     for rule in rules:
-        yield f"# {named(rule)}: {rule.describe()}: {asks(rule)}"
-    for each in left_out:
-        yield f"# left out: {each}"
-    for rule in rules:
-        if why := why_not(rule):
-            yield f"# left out: {named(rule)}: {why}"
+        try:
+            made.append((rule, make(rule)))
+        except ValueError as error:  # noqa: PERF203 - the others are made
+            left_out += rule.left_out(str(error))
+    return made, tuple(left_out)

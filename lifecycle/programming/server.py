@@ -11,18 +11,20 @@ from __future__ import annotations
 import abc
 import ipaddress
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
+from msgspec import to_builtins
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
-from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.programming.http import Api, as_segment
+from lifecycle.errors import UsageError
+from lifecycle.programming.http import Api, as_segment, text_of
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks
+from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
 from lifecycle.programming.settings import ServerSettings, device_networks, load_settings
 from lifecycle.programming.target import (
     ChangeKind,
@@ -34,6 +36,7 @@ from lifecycle.programming.target import (
     Target,
     TargetChanges,
     describe_rule,
+    each_done,
 )
 
 Body = dict[str, Any]
@@ -78,13 +81,9 @@ def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]
     source = (rule.source_address, rule.source_port)
     destination = (rule.destination_address, rule.destination_port)
     networks = device_networks(devices)
+    ends = (DeviceEnd(False, *destination, *source), DeviceEnd(True, *source, *destination))
     found = tuple(
-        end
-        for name, end in (
-            ("destination", DeviceEnd(False, *destination, *source)),
-            ("source", DeviceEnd(True, *source, *destination)),
-        )
-        if name in devices or any(ipaddress.ip_address(end.device) in each for each in networks)
+        end for end in ends if any(ipaddress.ip_address(end.device) in each for each in networks)
     )
     if not found:
         text = ", ".join(map(str, networks))
@@ -92,27 +91,24 @@ def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]
     return found
 
 
-def class_name(rule: FlowRule, names: Mapping[int, str], default: str, *, setting: str) -> str:
+def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str:
     """Return what the operator calls the class that a flow asks for.
 
     Args:
         rule: of the flow.
         names: by 5QI.
-        default: for flows whose 5QI has no name or that ask for none; empty leaves them out.
         setting: name of `names` in the settings, for the message.
 
     Raises:
         ValueError: there is no name.
     """
-    if rule.five_qi is not None and rule.five_qi in names:
-        return names[rule.five_qi]
-    if default:
-        return default
     if rule.five_qi is None:
-        raise ValueError(f"it asks for no 5QI ({asks(rule)}), and there is no default class")
-    raise ValueError(
-        f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
-    )
+        raise ValueError(f"it asks for no 5QI ({asks(rule)})")
+    if rule.five_qi not in names:
+        raise ValueError(
+            f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
+        )
+    return names[rule.five_qi]
 
 
 class Wanted(msgspec.Struct, frozen=True, kw_only=True):
@@ -133,7 +129,7 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         id: what the server calls it.
-        expires_s: seconds since the epoch; None if it does not expire.
+        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
         detail: for people: "granted for 600 s instead of 3600 s".
         differs: why it is not what was asked for; empty if it is.
     """
@@ -162,14 +158,7 @@ class ServerTarget(Target):
     def __init__(self, settings: str, means: Means) -> None:
         super().__init__(settings, means)
         self._server: Any = self._of_file(settings)
-        self._api = Api(
-            self._server.scope,
-            token=self._server.token,
-            timeout_s=self._server.timeout_s,
-            patience=means.patience,
-            clock=means.clock,
-            deadline=means.deadline,
-        )
+        self._api = Api(self._server, means)
         path = str(Path(settings).absolute())
         self._record = TargetRecord(target=self.kind, scope=self._api.url, settings=path)
         self.name = f"{self.kind} at {self._api.url}"
@@ -238,21 +227,19 @@ class ServerTarget(Target):
         cls, rules: Iterable[FlowRule], server: Any
     ) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
         """Return one request per flow and device, and the flows that none can be made for."""
-        wanted: list[Wanted] = []
-        left: list[str] = []
-        for rule in rules:
-            try:
-                wanted += [
-                    Wanted(
-                        key=f"{rule.key} {'from' if end.sends else 'to'} device",
-                        rule=rule,
-                        body=cls.body(rule, end, server),
-                    )
-                    for end in device_ends(rule, server.devices)
-                ]
-            except ValueError as error:  # noqa: PERF203 - the other flows are asked for
-                left += rule.left_out(str(error))
-        return tuple(wanted), tuple(left)
+
+        def make(rule: FlowRule) -> list[Wanted]:
+            return [
+                Wanted(
+                    key=f"{rule.key} {'from' if end.sends else 'to'} device",
+                    rule=rule,
+                    body=cls.body(rule, end, server),
+                )
+                for end in device_ends(rule, server.devices)
+            ]
+
+        made, left_out = expressed(rules, make)
+        return tuple(each for _, of in made for each in of), left_out
 
     @staticmethod
     @abc.abstractmethod
@@ -268,16 +255,18 @@ class ServerTarget(Target):
         """Ask for it."""
 
     @abc.abstractmethod
-    def find(self, body: Body) -> Made | None:
-        """Look for one that was asked for with this body; None if there is none."""
+    def look(self, id_: str, body: Body) -> Made | None:
+        """Look at one, and compare it with what was asked for; None if there is none.
 
-    @abc.abstractmethod
-    def see(self, id_: str, body: Body) -> Made | None:
-        """Look at one, and compare it with what was asked for; None if it is gone."""
+        Args:
+            id_: what the server calls it; empty looks for one that is just as asked for.
+            body: that was asked for.
+        """
 
-    @abc.abstractmethod
-    def update(self, id_: str, before: Body, body: Body) -> Made:
-        """Change one; the id may become another."""
+    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - may be compared
+        """Change one; here by a new one, after the old, as two for one flow may be a conflict."""
+        self.delete(id_)
+        return self.create(body)
 
     def delete(self, id_: str) -> None:
         """Delete one; that it is gone already is no error."""
@@ -327,17 +316,12 @@ class ServerTarget(Target):
         if entry is None:
             return ChangeKind.CREATE, ""
         asked: Body = json.loads(entry.body)
-        if not entry.id:
-            found = self.find(asked)
-            if found is None:
-                return ChangeKind.CREATE, "asked for before, but never made"
-            entry = replace(entry, id=found.id)
-            self._note(entry)
-        seen = self.see(entry.id, asked)
+        seen = self.look(entry.id, asked)
         if seen is None:
-            return ChangeKind.CREATE, "gone from the server"
-        if seen.expires_s != entry.expires_s:
-            self._note(replace(entry, expires_s=seen.expires_s))
+            gone = "gone from the server" if entry.id else "asked for before, but never made"
+            return ChangeKind.CREATE, gone
+        if not entry.id or (seen.expires_s or math.inf) < (entry.expires_s or math.inf) - 1:
+            self._note(entry.key, replace(entry, id=seen.id, expires_s=seen.expires_s))
         if asked != body:
             return ChangeKind.UPDATE, ""
         if seen.differs:
@@ -346,70 +330,80 @@ class ServerTarget(Target):
 
     def _carried_out(self, wanted: Sequence[Wanted]) -> TargetChanges:
         planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
-        done: list[FlowChange] = []
-        errors: list[tuple[str, LifecycleError]] = []
-        for change, body in planned:
-            try:
-                detail = self._make(change, body)
-            except LifecycleError as error:  # noqa: PERF203 - the other flows go on
-                errors.append((change.key, error))
-            else:
-                done.append(replace(change, detail=detail or change.detail))
+        done, failed = each_done(planned, self._make)
         made = TargetChanges(target=self.name, changes=tuple(done))
-        if errors:
+        if failed:
+            errors = [(change.key, error) for (change, _), error in failed]
             text = [made.render(done=True)] if made.pending else []
             raise PartlyError(self.name, len(planned), errors, done=text)
         return made
 
-    def _make(self, change: FlowChange, body: Body) -> str:
-        """Make one change; returns what is to be reported of it."""
+    def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
+        """Make one change; return it with what came of it."""
+        change, body = planned
+        if change.kind is ChangeKind.KEEP:
+            return change
         if change.kind is ChangeKind.CREATE:
-            return self._create(change, body)
+            made = self._create(change, body)
+            return replace(change, detail=made.detail or change.detail)
         entry = self._entries()[change.key]
+        asked = json.loads(entry.body)
         if change.kind is ChangeKind.UPDATE:
-            made = self.update(entry.id, json.loads(entry.body), body)
-            self._note(_entry(change, body, made))
-            return made.detail
-        if change.kind is ChangeKind.DELETE:
-            found = Made(id=entry.id) if entry.id else self.find(json.loads(entry.body))
-            if found is not None:
-                self.delete(found.id)
-            self._forget(change.key)
-        return ""
+            made = self.update(entry.id, asked, body)
+            self._note(change.key, _entry(change, body, made))
+            return replace(change, detail=made.detail or change.detail)
+        found = Made(id=entry.id) if entry.id else self.look("", asked)
+        if found is not None:
+            self.delete(found.id)
+        self._note(change.key, None)
+        return change
 
-    def _create(self, change: FlowChange, body: Body) -> str:
-        self._note(_entry(change, body, None))
+    def _create(self, change: FlowChange, body: Body) -> Made:
+        self._note(change.key, _entry(change, body, None))
+        made: Made | None = None
         try:
             made = self.create(body)
         except HttpError as error:
             if not error.uncertain:
-                self._forget(change.key)
+                self._note(change.key, None)
                 raise
             try:
-                found = self.find(body)
+                made = self.look("", body)
             except HttpError as second:
                 raise error from second
-            if found is None:
+            if made is None:
                 # The entry stays pending: the server may still be making it.
                 raise
-            made = found
-        self._note(_entry(change, body, made))
-        return made.detail
+        self._note(change.key, _entry(change, body, made))
+        return made
 
     def _entries(self) -> dict[str, Entry]:
         """What is ours there, by key."""
-        return {each.key: each for each in self._ledger.entries(self._record)}
+        found = self._ledger.find(self._record)
+        return {each.key: each for each in found.entries} if found else {}
 
-    def _note(self, entry: Entry) -> None:
-        every = {**self._entries(), entry.key: entry}
-        self._ledger.put(replace(self._record, entries=tuple(every.values())))
+    def _note(self, key: str, entry: Entry | None) -> None:
+        every = {**self._entries(), key: entry}
+        entries = tuple(each for each in every.values() if each is not None)
+        self._ledger.put(replace(self._record, entries=entries))
 
-    def _forget(self, key: str) -> None:
-        every = tuple(each for name, each in self._entries().items() if name != key)
-        if every:
-            self._ledger.put(replace(self._record, entries=every))
-        else:
-            self._ledger.drop(self._record)
+
+def differs(
+    asked: Mapping[str, Any], seen: msgspec.Struct, keys: Iterable[str], *, missing: bool = False
+) -> str:
+    """Return why what a server shows is not what was asked for; empty if it is.
+
+    Args:
+        asked: our body.
+        seen: the server's, which leaves out what is not shown; it may add to ours.
+        keys: that are compared.
+        missing: something that the server does not show differs too.
+    """
+    shown = to_builtins(seen)
+    for key in keys:
+        if (missing or key in shown) and shown.get(key) != asked.get(key):
+            return f"the server has {key} {text_of(str(shown.get(key)))!r}"
+    return ""
 
 
 def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:

@@ -24,7 +24,6 @@ from lifecycle.programming.target import TARGETS, SettingsError, target_kind
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
-_ENDS = ("source", "destination")
 
 IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
 
@@ -90,8 +89,7 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     Attributes:
         url: of its interface.
-        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
-            `destination` for that end of every flow.
+        devices: addresses or networks of the network's devices, `10.45.0.0/16`.
         token: None sends none.
         timeout_s: of one request, > 0.
     """
@@ -117,8 +115,7 @@ def device_networks(devices: Iterable[str]) -> tuple[IpNetwork, ...]:
     """Return the networks among what says which ends of flows are devices.
 
     Args:
-        devices: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and
-            `destination` for that end of every flow.
+        devices: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses.
 
     Raises:
         ValueError: not a network, or none at all: without it no end is known to be a device.
@@ -127,9 +124,9 @@ def device_networks(devices: Iterable[str]) -> tuple[IpNetwork, ...]:
     if not every:
         raise ValueError(
             "cannot tell which ends of flows are devices: devices is empty; name the addresses or "
-            "networks of the devices, such as 10.45.0.0/16, or 'source' or 'destination'"
+            "networks of the devices, such as 10.45.0.0/16"
         )
-    return tuple(_network(each) for each in every if each not in _ENDS)
+    return tuple(map(_network, every))
 
 
 def _network(text: str) -> IpNetwork:

@@ -11,7 +11,7 @@ import abc
 import enum
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -21,6 +21,9 @@ from lifecycle.programming.rules import FlowRule, RuleSet, asks
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 TARGETS = ("nft", "tc", "nef", "camara")
 
@@ -193,7 +196,7 @@ class Target(abc.ABC):
         """Delete everything of ours."""
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return what would be sent, checked as far as that is possible; changes nothing."""
+        """Return what would be sent if nothing were there; changes nothing."""
         return self.export(self._settings, RuleSet(rules=tuple(rules)), self._ledger.system)
 
     def renew(self) -> float | None:
@@ -255,38 +258,29 @@ def _either(words: Sequence[str]) -> str:
     return f"{', '.join(most)} or {last}" if most else last
 
 
+def each_done(
+    things: Iterable[T], do: Callable[[T], R]
+) -> tuple[list[R], list[tuple[T, LifecycleError]]]:
+    """Do it to each, whatever becomes of the others; return what was done, and what failed."""
+    done: list[R] = []
+    failed: list[tuple[T, LifecycleError]] = []
+    for each in things:
+        try:
+            done.append(do(each))
+        except LifecycleError as error:  # noqa: PERF203 - the others go on
+            failed.append((each, error))
+    return done, failed
+
+
 def describe_rule(rule: FlowRule) -> str:
     """Return a rule for people: the tuple and what it gets."""
     return f"{rule.describe()}, {asks(rule)}"
 
 
-def usable(
-    rules: Iterable[FlowRule], why_not: Callable[[FlowRule], str]
-) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
-    """Return the rules that `why_not` has no reason against, and the others with their reasons."""
-    reasons = [(each, why_not(each)) for each in rules]
-    return (
-        tuple(each for each, why in reasons if not why),
-        tuple(f"{each.key}: {why}" for each, why in reasons if why),
-    )
-
-
 class ProgrammingError(LifecycleError):
-    """A network refused, or could not be reached or read."""
+    """A network refused, or could not be reached or read; or what is there is not ours."""
 
     exit_code = ExitCode.BRING_UP_FAILED
-
-
-class PrivilegeError(ProgrammingError):
-    """A command needs a privilege that this process lacks."""
-
-
-class MissingFeatureError(ProgrammingError):
-    """The kernel or the machine lacks something: a queueing discipline, a program."""
-
-
-class NotOursError(ProgrammingError):
-    """An object that is not ours is in the way; it is never touched."""
 
 
 class SettingsError(UsageError):
@@ -299,14 +293,25 @@ class HttpError(ProgrammingError):
     Attributes:
         status: HTTP status; 0 if there was no answer.
         uncertain: the request may have taken effect all the same.
+        again: it may be asked again.
+        after_s: how long the server asks to wait before that; None if it does not say.
     """
 
     def __init__(
-        self, message: str, *, status: int = 0, uncertain: bool = False, hint: str = ""
+        self,
+        message: str,
+        *,
+        status: int = 0,
+        uncertain: bool = False,
+        again: bool = False,
+        after_s: float | None = None,
+        hint: str = "",
     ) -> None:
         super().__init__(message, hint=hint)
         self.status = status
         self.uncertain = uncertain
+        self.again = again
+        self.after_s = after_s
 
 
 class PartlyError(ProgrammingError):

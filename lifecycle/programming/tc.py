@@ -1,10 +1,10 @@
 """tc on one device of this host: an htb class for each class of flows, which nft puts packets into.
 
 Owns: the qdisc `1f10:` at the root of a device; which classes a link has for a set of rules: the
-ranking of DSCPs and 5QIs and how the link's rate is divided; the classes' queues; and the table
-`inet flowtc_<device>_<system>`, which puts packets into classes. The handle and the table's comment
-are the marks of ownership: any other root qdisc is left alone. Where the classes change, ours is
-removed and made anew; where only flows change, the table is replaced.
+ranking of DSCPs and 5QIs and how the link's rate is divided; the classes' queues; and what the
+table `inet flowtc_<device>_<system>` puts into which class. The handle is the mark of ownership:
+any other root qdisc is left alone. Where the classes change, ours is removed and made anew; where
+only flows change, the table is replaced.
 
 The kernel's own queues do not rank by DSCP as people expect: pfifo_fast and prio put EF, CS6 and DF
 into one band. So each class of the rules gets a queue of its own here.
@@ -18,39 +18,28 @@ router sees ports in first fragments only: match by mark there.
 from __future__ import annotations
 
 import enum
-import hashlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.nft import (
-    Action,
-    NftTable,
-    compare,
-    nft_keyword,
+from lifecycle.programming.rules import FlowRule, named
+from lifecycle.programming.tables import (
+    Placed,
+    TableTarget,
+    Wanted,
+    chain_line,
+    flow_match,
     render_table,
     table_name,
 )
-from lifecycle.programming.rules import FlowRule, RuleSet, remarks
-from lifecycle.programming.target import (
-    ChangeKind,
-    FlowChange,
-    Means,
-    MissingFeatureError,
-    NotOursError,
-    ProgrammingError,
-    Target,
-    TargetChanges,
-    usable,
-)
+from lifecycle.programming.target import Means, ProgrammingError
 from lifecycle.programming.tool import HostTool, Qdisc, demand, qdiscs
 
 OWNED_HANDLE = "1f10:"
@@ -84,11 +73,9 @@ _QUANTUM_BYTES = 3028
 
 _LONGEST_QUEUE_MS = 10_000
 _DEVICE = re.compile(r"[^\s/:#\"*]{1,15}")
-_CLASSES = re.compile(r"managed-by=lifecycle digest=[0-9a-f]+ classes=(?P<digest>[0-9a-f]+)")
 _NO_DEVICE = re.compile(r"cannot find device", re.IGNORECASE)
-_RATE = re.compile(r"([0-9]{1,9})(bit|kbit|mbit|gbit)")
+_QUANTITY = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,3})?)([a-z]+)")
 _KBIT = {"bit": 0.001, "kbit": 1, "mbit": 1000, "gbit": 1_000_000}
-_DURATION = re.compile(r"([0-9]{1,6}(?:\.[0-9]{1,3})?)(us|ms|s)")
 _MS = {"us": 0.001, "ms": 1.0, "s": 1000.0}
 
 
@@ -141,8 +128,7 @@ def parse_rate(text: str) -> int:
     Raises:
         ValueError: not such a rate, or below 1 kbit/s.
     """
-    match = _RATE.fullmatch(text.strip().lower())
-    kbit = int(int(match[1]) * _KBIT[match[2]]) if match else 0
+    kbit = int(_quantity(text, _KBIT))
     if kbit < 1:
         raise ValueError(f"cannot use rate {text!r}; use a number and kbit, mbit or gbit: 20mbit")
     return kbit
@@ -154,11 +140,16 @@ def parse_queue(text: str) -> float:
     Raises:
         ValueError: not such a time, or zero.
     """
-    match = _DURATION.fullmatch(text.strip().lower())
-    queue_ms = float(match[1]) * _MS[match[2]] if match else 0.0
+    queue_ms = _quantity(text, _MS)
     if queue_ms <= 0:
         raise ValueError(f"cannot use queue {text!r}; use a number and us, ms or s: 50ms")
     return queue_ms
+
+
+def _quantity(text: str, units: Mapping[str, float]) -> float:
+    """A number with a unit behind it; 0 if it is no such thing."""
+    match = _QUANTITY.fullmatch(text.strip().lower())
+    return float(match[1]) * units.get(match[2], 0.0) if match else 0.0
 
 
 class TrafficClass(msgspec.Struct, frozen=True, kw_only=True, order=True):
@@ -181,10 +172,10 @@ class TrafficClass(msgspec.Struct, frozen=True, kw_only=True, order=True):
         """Whether everything else comes before it."""
         return self.rank[0] > _RANK_DEFAULT
 
-    @property
-    def action(self) -> Action:
-        """What puts packets into it."""
-        return Action(self.name, f"meta priority set {OWNED_HANDLE}{self.minor:x}", self.comment)
+
+_REST = TrafficClass(
+    rank=(_RANK_DEFAULT, 0), name="everything else", minor=DEFAULT_MINOR, comment="everything else"
+)
 
 
 def class_of(rule: FlowRule) -> TrafficClass | None:
@@ -192,9 +183,25 @@ def class_of(rule: FlowRule) -> TrafficClass | None:
 
     DF is the rest itself.
     """
-    if rule.dscp is not None:
-        return None if rule.dscp == 0 else _by_dscp(rule.dscp)
-    return None if rule.five_qi is None else _by_five_qi(rule.five_qi)
+    if rule.dscp:
+        name = dscp_name(rule.dscp).lower()
+        group = _RANK_LOWEST if rule.dscp in _LOWEST else _RANK_MARKED
+        return TrafficClass(
+            rank=(_RANK_FIRST if rule.dscp in _FIRST else group, -rule.dscp),
+            name=f"dscp{name}" if name.isdecimal() else name,
+            minor=0x100 + rule.dscp,
+            comment=describe(rule.dscp),
+        )
+    if rule.dscp is None and rule.five_qi is not None:
+        five_qi = five_qi_of(rule.five_qi)
+        group = _RANK_GBR if five_qi.resource_type.guarantees_rate else _RANK_NON_GBR
+        return TrafficClass(
+            rank=(group, five_qi.priority_level),
+            name=f"5qi{rule.five_qi}",
+            minor=0x200 + rule.five_qi,
+            comment=str(five_qi),
+        )
+    return None
 
 
 def classes_of(rules: Iterable[FlowRule]) -> tuple[TrafficClass, ...]:
@@ -202,36 +209,10 @@ def classes_of(rules: Iterable[FlowRule]) -> tuple[TrafficClass, ...]:
     return tuple(sorted({found for rule in rules if (found := class_of(rule)) is not None}))
 
 
-def _by_dscp(dscp: int) -> TrafficClass:
-    name = dscp_name(dscp).lower()
-    group = _RANK_MARKED
-    if dscp in _FIRST:
-        group = _RANK_FIRST
-    elif dscp in _LOWEST:
-        group = _RANK_LOWEST
-    return TrafficClass(
-        rank=(group, -dscp),
-        name=f"dscp{name}" if name.isdecimal() else name,
-        minor=0x100 + dscp,
-        comment=describe(dscp),
-    )
-
-
-def _by_five_qi(value: int) -> TrafficClass:
-    five_qi = five_qi_of(value)
-    group = _RANK_GBR if five_qi.resource_type.guarantees_rate else _RANK_NON_GBR
-    return TrafficClass(
-        rank=(group, five_qi.priority_level),
-        name=f"5qi{value}",
-        minor=0x200 + value,
-        comment=str(five_qi),
-    )
-
-
 def divide(
-    classes: Iterable[TrafficClass], *, link_kbit: int, guaranteed_kbit: Mapping[str, int] = {}
-) -> tuple[dict[str, int], int]:
-    """Return the guaranteed rate of each class by name, and that of the rest, in kbit/s.
+    classes: Sequence[TrafficClass], *, link_kbit: int, guaranteed_kbit: Mapping[str, int] = {}
+) -> dict[TrafficClass, int]:
+    """Return the guaranteed rate of each class and of the rest, in kbit/s, the first in front.
 
     Classes without a given rate share what is left equally with the rest; those below the rest
     get a hundredth of the link, so that they do not starve.
@@ -245,103 +226,54 @@ def divide(
     Raises:
         ValueError: a rate is not positive, an unknown class has one, or there is not enough.
     """
-    every = tuple(classes)
-    known = ", ".join(each.name for each in every) or "none"
+    names = [each.name for each in classes]
     if link_kbit < 1:
         raise ValueError(f"cannot divide a link of {link_kbit} kbit/s; use 1 or more")
     for name, rate in guaranteed_kbit.items():
-        if name not in {each.name for each in every}:
+        if name not in names:
             raise ValueError(
-                f"cannot guarantee a rate to class {name!r}; classes of these rules are: {known}"
+                f"cannot guarantee a rate to class {name!r}; classes of these rules are: "
+                f"{', '.join(names) or 'none'}"
             )
         if rate < 1:
             raise ValueError(f"cannot guarantee {rate} kbit/s to class {name}; use 1 or more")
-    rates = {
-        each.name: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))
+    every = sorted((*classes, _REST))
+    given = {
+        each: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))
         for each in every
         if each.below_default or each.name in guaranteed_kbit
     }
-    open_ = [each.name for each in every if each.name not in rates]
-    left = link_kbit - sum(rates.values())
-    share = left // (len(open_) + 1)
+    others = [each for each in every if each not in given]
+    left = link_kbit - sum(given.values())
+    share = left // len(others)
     if share < 1:
-        given = ", ".join(f"{name} {rate}" for name, rate in rates.items())
+        rates = ", ".join(f"{each.name} {rate}" for each, rate in given.items())
         raise ValueError(
-            f"cannot guarantee {sum(rates.values())} kbit/s ({given}) on a link of "
+            f"cannot guarantee {sum(given.values())} kbit/s ({rates}) on a link of "
             f"{link_kbit} kbit/s: something must be left for "
-            f"{', '.join((*open_, 'everything else'))}"
+            f"{', '.join(each.name for each in others)}"
         )
-    rates.update((name, share) for name in open_)
-    return {each.name: rates[each.name] for each in every}, left - share * len(open_)
-
-
-class Queues(NamedTuple):
-    """What makes a device queue by class.
-
-    Attributes:
-        batch: the lines for `tc -batch` where nothing of ours is there.
-        table: for `nft -f`; its comment has the digest of the classes.
-    """
-
-    batch: str
-    table: str
-
-
-def queues(rules: Sequence[FlowRule], settings: TcSettings, *, system: str) -> Queues:
-    """Return what makes a device queue these rules by class.
-
-    Raises:
-        ValueError: the rates do not fit the link.
-        UsageError: the system's name is not one that a manifest may have.
-    """
-    classes = "\n".join(_htb(classes_of(rules), settings)) + "\n"
-    by_flow = settings.match is TcMatch.FLOW
-    placed = [(rule, class_.action) for rule in rules if (class_ := class_of(rule)) is not None]
-    device = settings.device
-    table = render_table(
-        _table_name(system, device),
-        [(rule, (action,)) for rule, action in placed if by_flow],
-        about=f"classes={hashlib.sha256(classes.encode()).hexdigest()[:16]}",
-        priority="-149",  # after the marks of the system's own table, which are set at `mangle`
-        device=device,
-        more=() if by_flow else tuple(_by_mark(rules)),
-    )
-    qdisc = f"qdisc add dev {device} root handle {OWNED_HANDLE} htb default {DEFAULT_MINOR:#x}\n"
-    return Queues(batch=qdisc + classes, table=table)
+    found = {each: given.get(each, share) for each in every}
+    found[_REST] += left - share * len(others)
+    return found
 
 
 def _table_name(system: str, device: str) -> str:
     """The name of a device's table, `flowtc_eth0_teleop`."""
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", device)
-    return table_name(system).replace("flowqos_", f"flowtc_{plain}_", 1)
-
-
-def _by_mark(rules: Sequence[FlowRule]) -> Iterator[str]:
-    for dscp in sorted({each.dscp for each in rules if each.dscp}):
-        action = _by_dscp(dscp).action
-        for network in ("ip", "ip6"):
-            yield (
-                f"{network} dscp {nft_keyword(dscp)} {action.statement} "
-                f'counter comment "{action.comment}"'
-            )
+    return table_name(system, f"flowtc_{re.sub(r'[^A-Za-z0-9_.-]', '_', device)}")
 
 
 def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]:
     device, link_kbit, major = settings.device, settings.link_kbit, OWNED_HANDLE
-    rates, rest = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
+    rates = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
     yield (
         f"class replace dev {device} parent {major} classid {major}1 "
         f"htb rate {link_kbit}kbit ceil {link_kbit}kbit quantum {_QUANTUM_BYTES}"
     )
-    above = [each for each in classes if not each.below_default]
-    below = [each for each in classes if each.below_default]
-    leaves = [
-        *((each.minor, rates[each.name], min(i, 5), each.comment) for i, each in enumerate(above)),
-        (DEFAULT_MINOR, rest, 6, "everything else"),
-        *((each.minor, rates[each.name], 7, each.comment) for each in below),
-    ]
-    for minor, rate, prio, comment in leaves:
-        yield f"# class {major}{minor:x}: {comment}"
+    for index, (class_, rate) in enumerate(rates.items()):
+        minor = class_.minor
+        prio = 7 if class_.below_default else 6 if class_ is _REST else min(index, 5)
+        yield f"# class {major}{minor:x}: {class_.comment}"
         yield (
             f"class replace dev {device} parent {major}1 classid {major}{minor:x} "
             f"htb rate {rate}kbit ceil {link_kbit}kbit prio {prio} quantum {_QUANTUM_BYTES}"
@@ -352,38 +284,6 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
         )
 
 
-def render_tc(
-    rules: Iterable[FlowRule],
-    settings: TcSettings,
-    *,
-    system: str,
-    left_out: Sequence[str] = (),
-) -> str:
-    """Return a file for `sh FILE` that gives `tc -batch` and `nft -f` their lines.
-
-    Args:
-        rules: of verified flows.
-        settings: of the device.
-        system: names the table.
-        left_out: flows without a rule, named in comments.
-
-    Raises:
-        ValueError: see `queues`.
-    """
-    every = tuple(rules)
-    made = queues(every, settings, system=system)
-    lines = [
-        f"# Queues the verified flows of system {system} on {settings.device}: sh FILE",
-        *remarks(every, left_out, lambda rule: _why_not(rule, settings)),
-        "set -e",
-        "tc -batch - <<'END'",
-        made.batch + "END",
-        "nft -f - <<'END'",
-        made.table + "END",
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def render_tc_removal(device: str) -> str:
     """Return the line for `tc -batch` that removes our qdisc and all below it.
 
@@ -392,20 +292,7 @@ def render_tc_removal(device: str) -> str:
     return f"qdisc del dev {device} root handle {OWNED_HANDLE}\n"
 
 
-def _why_not(rule: FlowRule, settings: TcSettings) -> str:
-    if class_of(rule) is None:
-        return "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
-    if rule.dscp is None and settings.match is TcMatch.MARK:
-        return "it has no DSCP, and rules look at nothing else here"
-    return ""
-
-
-def _classes_digest(text: str) -> str:
-    match = _CLASSES.search(text)
-    return match["digest"] if match else ""
-
-
-class TcTarget(Target):
+class TcTarget(TableTarget):
     """One device.
 
     Args:
@@ -416,13 +303,12 @@ class TcTarget(Target):
 
     kind = "tc"
     hint = "give --device eth0 --rate 20mbit"
+    gone = "the qdisc was gone"
 
     def __init__(self, settings: TcSettings, means: Means, tool: HostTool | None = None) -> None:
-        super().__init__(settings, means)
         self._device = settings.device
-        self._tool = tool or HostTool()
-        self._table = NftTable(_table_name(means.ledger.system, self._device), self._tool)
-        self._record = TargetRecord(target=self.kind, scope=self._device)
+        table = _table_name(means.ledger.system, self._device)
+        super().__init__(settings, means, tool, table=table, scope=self._device)
         self.name = f"tc on {self._device}"
 
     @classmethod
@@ -456,91 +342,70 @@ class TcTarget(Target):
         """Return the device of a record."""
         return TcSettings(device=record.scope, link_kbit=1)
 
-    @classmethod
-    def export(cls, settings: TcSettings, rules: RuleSet, system: str) -> str:
-        """Return the lines for tc and nft."""
-        return render_tc(rules.rules, settings, system=system, left_out=rules.left_out)
+    @staticmethod
+    def lines(rule: FlowRule, settings: TcSettings) -> Sequence[str]:
+        """Return what puts its packets into their class."""
+        class_ = class_of(rule)
+        if class_ is None:
+            raise ValueError(
+                "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
+            )
+        matches, comment = [flow_match(rule)], f"{class_.comment}: {named(rule)}"
+        if settings.match is TcMatch.MARK:
+            if rule.dscp is None:
+                raise ValueError("it has no DSCP, and rules look at nothing else here")
+            matches = [f"{each} dscp {rule.dscp}" for each in ("ip", "ip6")]
+            comment = class_.comment
+        statement = f"meta priority set {OWNED_HANDLE}{class_.minor:x}"
+        out = f'oifname "{settings.device}"'
+        return [chain_line(f"{out} {match}", statement, comment) for match in matches]
 
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Compare the device with the rules.
+    @staticmethod
+    def wanted(placed: Placed, settings: TcSettings, system: str) -> Wanted:
+        """Return lines for `tc -batch`, and the table."""
+        device = settings.device
+        table = render_table(
+            _table_name(system, device),
+            (each for _, lines in placed for each in lines),
+            priority="-149",  # after the marks of the system's own table, which are set at `mangle`
+        )
+        qdisc = f"qdisc add dev {device} root handle {OWNED_HANDLE} htb default {DEFAULT_MINOR:#x}"
+        classes = _htb(classes_of(rule for rule, _ in placed), settings)
+        return Wanted(table, beside="\n".join((qdisc, *classes, "")))
 
-        Raises:
-            NotOursError: the device has a root qdisc that is not ours.
-            ProgrammingError: there is no such device, or the rates do not fit.
-        """
-        return self._planned(rules)[0]
+    @staticmethod
+    def script(wanted: Wanted, remarks: Sequence[str], settings: TcSettings, system: str) -> str:
+        """Return a file for `sh FILE` that gives `tc -batch` and `nft -f` their lines."""
+        lines = [
+            f"# Queues the verified flows of system {system} on {settings.device}: sh FILE",
+            *remarks,
+            "set -e",
+            "tc -batch - <<'END'",
+            f"{wanted.beside}END",
+            "nft -f - <<'END'",
+            f"{wanted.table}END",
+            "",
+        ]
+        return "\n".join(lines)
 
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Bring qdisc, classes and table up to date."""
-        planned, wanted, listing = self._planned(rules)
-        if wanted is None:
-            return replace(self.remove(), left_out=planned.left_out)
-        recorded = self._ledger.has(self._record)
-        if not planned.pending and recorded:
-            return planned
-        # Written first: a crash in between leaves nothing unknown.
-        self._ledger.put(self._record)
-        try:
-            if _classes_digest(listing) != _classes_digest(wanted.table):
-                if listing or recorded:
-                    self._clear()
-                self._batch(wanted.batch)
-            self._table.write(wanted.table)
-        except ProgrammingError as error:
-            # `tc -batch` is not atomic: it stops at a line, and what came before stays.
-            try:
-                if listing or recorded or self._is_ours():
-                    self._clear()
-            except ProgrammingError as left:
-                message = f"{error.message}; the qdisc {OWNED_HANDLE} on {self._device} is left"
-                raise type(error)(f"{message}: {left}", hint=error.hint) from error
-            self._ledger.drop(self._record)
-            raise
-        return planned
+    def found(self) -> str:
+        """Return the table, where the device has our qdisc."""
+        return f"{OWNED_HANDLE}\n{self.listing()}" if self._own_root() else ""
 
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return the lines for tc and nft; tc itself has no dry run to check them."""
-        return f"# Not checked: tc has no dry run.\n{super().dry_run(rules)}"
+    def write(self, wanted: Wanted, *, anew: bool) -> None:
+        """Write the table, and before it the qdisc and its classes anew."""
+        if anew:
+            if self._is_ours():
+                self.clear()
+            self._batch(wanted.beside)
+        self.write_table(wanted.table)
 
-    def remove(self) -> TargetChanges:
-        """Delete the qdisc if it is ours, and with it all below; and its table."""
-        ours = self._is_ours()
-        listing = self._table.listing() if ours or self._ledger.has(self._record) else ""
-        if not listing and not self._ledger.has(self._record):
-            return TargetChanges(target=self.name)
-        self._clear()
-        self._ledger.drop(self._record)
-        gone = FlowChange(kind=ChangeKind.DELETE, key=self._device)
-        return TargetChanges(target=self.name, changes=(gone,) if ours or listing else ())
-
-    def _planned(self, rules: Sequence[FlowRule]) -> tuple[TargetChanges, Queues | None, str]:
-        """What is to change, what is wanted (None for nothing), and the table as it is."""
-        classed, left_out = usable(rules, lambda rule: _why_not(rule, self._settings))
-        ours = self._own_root()
-        listing = self._table.listing() if ours else ""
-        wanted = None
-        changes: tuple[FlowChange, ...] = ()
-        if classed:
-            try:
-                wanted = queues(classed, self._settings, system=self._ledger.system)
-            except ValueError as error:
-                raise MissingFeatureError(str(error)) from error
-            detail = ""
-            if not ours and self._ledger.has(self._record):
-                detail = "the qdisc was gone"
-            elif listing and _classes_digest(listing) != _classes_digest(wanted.table):
-                detail = "the classes change"
-            changes = compare(listing, wanted.table, classed, detail=detail)
-        elif ours:
-            changes = (FlowChange(kind=ChangeKind.DELETE, key=self._device),)
-        done = TargetChanges(target=self.name, changes=changes, left_out=left_out)
-        return done, wanted, listing
-
-    def _clear(self) -> None:
+    def clear(self) -> bool:
         """Delete our qdisc and our table, where they are."""
-        if self._is_ours():
+        ours = self._is_ours()
+        if ours:
             self._batch(render_tc_removal(self._device))
-        self._table.remove()
+        return super().clear() or ours
 
     def _root(self) -> Qdisc | None:
         """The device's root qdisc; None if there is no such device."""
@@ -566,13 +431,13 @@ class TcTarget(Target):
         if root.handle == "0:":
             return False
         if root.handle != OWNED_HANDLE:
-            raise NotOursError(
+            raise ProgrammingError(
                 f"cannot use {self.name}: it has a root qdisc of another owner, {root.kind} "
                 f"{root.handle}",
                 hint=f"use another device, or remove it: tc qdisc del dev {device} root",
             )
-        if not self._ledger.has(self._record) and not self._table.listing():
-            raise NotOursError(
+        if self._ledger.find(self._record) is None and not self.listing():
+            raise ProgrammingError(
                 f"cannot use {self.name}: its root qdisc {root.handle} was made by lifecycle, but "
                 f"not for system {self._ledger.system!r} of this user",
                 hint="if nothing uses it any more: "

@@ -1,7 +1,6 @@
-"""Runs nft, tc and unshare: bounded, asked in English, each refusal as one sentence.
+"""Runs nft and tc: bounded, asked in English, each refusal as one sentence.
 
-Owns: what their refusals mean: a missing program, a missing privilege, a missing kernel feature;
-and the qdiscs that tc lists.
+Owns: what their refusals mean, such as a missing privilege; and the qdiscs that tc lists.
 """
 
 from __future__ import annotations
@@ -15,17 +14,13 @@ from collections.abc import Sequence
 import msgspec
 
 from lifecycle.codec import from_json
-from lifecycle.programming.target import (
-    MissingFeatureError,
-    PrivilegeError,
-    ProgrammingError,
-)
+from lifecycle.programming.target import ProgrammingError
 from lifecycle.run_directory import OWN_CHILD
 
 _TIMEOUT_S = 10.0
 """They talk to the kernel only; a busy machine needs tenths of a second."""
 
-_PACKAGES = {"nft": "nftables", "tc": "iproute2", "ip": "iproute2", "unshare": "util-linux"}
+_PACKAGES = {"nft": "nftables", "tc": "iproute2"}
 
 HOW_PRIVILEGED = (
     "run this command as root, or give it that capability: in a container --cap-add NET_ADMIN, in "
@@ -34,19 +29,9 @@ HOW_PRIVILEGED = (
 """Root is not enough where the capability was taken away: capabilities(7)."""
 
 _NO_PRIVILEGE = re.compile(r"operation not permitted|permission denied|must be root", re.IGNORECASE)
-_NO_FEATURE = re.compile(
-    r"qdisc kind is unknown|classifier not found|unknown qdisc|"
-    r"protocol not supported|operation not supported",
-    re.IGNORECASE,
-)
 
-
-class ToolOutput(msgspec.Struct, frozen=True, kw_only=True):
-    """What a program left."""
-
-    returncode: int
-    stdout: str
-    stderr: str
+Output = subprocess.CompletedProcess[str]
+"""What a program left."""
 
 
 class HostTool:
@@ -59,18 +44,17 @@ class HostTool:
     def __init__(self, prefix: Sequence[str] = ()) -> None:
         self._prefix = tuple(prefix)
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         """Run a program to its end and return what it left, whatever its exit code.
 
         Raises:
-            MissingFeatureError: it is not installed.
-            ProgrammingError: it does not end.
+            ProgrammingError: it is not installed, or does not end.
         """
         # Distributions keep these in sbin, which is not on every user's path.
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         try:
             with OWN_CHILD:
-                done = subprocess.run(
+                return subprocess.run(
                     [*self._prefix, *argv],
                     input=stdin,
                     capture_output=True,
@@ -83,7 +67,7 @@ class HostTool:
         except FileNotFoundError as error:
             program = str(error.filename or argv[0])
             package = _PACKAGES.get(program, program)
-            raise MissingFeatureError(
+            raise ProgrammingError(
                 f"cannot run {program!r}: it is not installed",
                 hint=f"install it: apt-get install {package}",
             ) from error
@@ -93,7 +77,6 @@ class HostTool:
             ) from error
         except OSError as error:
             raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
-        return ToolOutput(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
 
 
 def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
@@ -106,9 +89,7 @@ def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") 
         stdin: what it reads.
 
     Raises:
-        PrivilegeError: it needs a privilege; says which command.
-        MissingFeatureError: the kernel or the program is missing something.
-        ProgrammingError: it failed otherwise, with its own message.
+        ProgrammingError: see `failure`.
     """
     output = tool.run(argv, stdin=stdin)
     if output.returncode == 0:
@@ -147,19 +128,14 @@ def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
         ) from error
 
 
-def failure(output: ToolOutput, argv: Sequence[str], *, doing: str) -> ProgrammingError:
-    """Return the error that a failed program means."""
+def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
+    """Return the error that a failed program means: a missing privilege, or what it says itself."""
     command = shlex.join(argv)
-    said = _first_line(output.stderr) or f"exit code {output.returncode}"
+    printed = filter(None, map(str.strip, output.stderr.splitlines()))
+    said = next(printed, f"exit code {output.returncode}")
     if _NO_PRIVILEGE.search(output.stderr):
-        return PrivilegeError(
+        return ProgrammingError(
             f"cannot {doing}: {command!r} needs CAP_NET_ADMIN in this network namespace",
             hint=HOW_PRIVILEGED,
         )
-    if _NO_FEATURE.search(output.stderr):
-        return MissingFeatureError(f"cannot {doing}: {command!r} says {said!r}")
     return ProgrammingError(f"cannot {doing}: {command!r} says {said!r}")
-
-
-def _first_line(text: str) -> str:
-    return next((line.strip() for line in text.splitlines() if line.strip()), "")

@@ -25,16 +25,16 @@ from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
 from lifecycle.programming.ledger import Ledger
-from lifecycle.programming.nft import digest_of, root_qdiscs
+from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.settings import load_settings
 from lifecycle.programming.target import Means, ProgrammingError
-from lifecycle.programming.tool import HostTool, ToolOutput
+from lifecycle.programming.tool import HostTool, qdiscs
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer
 from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
-from tests.unit.programming.fakes import FakeTool, failed
+from tests.unit.programming.fakes import FakeTool, failed, printed
 from tests.unit.programming.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
@@ -85,7 +85,12 @@ def _ledger(path: Path) -> object:
 
 
 def _qdiscs(data: bytes, _: Path) -> object:
-    return root_qdiscs(FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr=""))))
+    return qdiscs(FakeTool(("tc", printed(_text(data)))), doing="list qdiscs")
+
+
+def _nft(data: bytes, folder: Path) -> object:
+    tool = FakeTool(("nft", printed(_text(data))))
+    return NftTarget(None, Means(Ledger(folder, "robot")), tool).plan([])
 
 
 def _printed(data: bytes, folder: Path) -> object:
@@ -97,8 +102,8 @@ def _tc(data: bytes, folder: Path) -> object:
     from lifecycle.programming.tc import TcSettings, TcTarget
 
     tool = FakeTool(
-        ("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")),
-        ("nft list", failed("Error: No such file or directory")),
+        ("tc", printed(_text(data))),
+        ("nft -s list", failed("Error: No such file or directory")),
     )
     settings = TcSettings(device="eth0", link_kbit=20_000)
     return TcTarget(settings, Means(Ledger(folder, "robot")), tool).plan([])
@@ -187,9 +192,9 @@ READERS: dict[str, Reader] = {
         errors=(LifecycleError,),
     ),
     "nft listing": Reader(
-        good=b'table inet flowqos_a {\n comment "managed by lifecycle digest 0123456789abcdef"\n}',
-        read=lambda data, _: digest_of(_text(data)),
-        errors=(),
+        good=b'table inet flowqos_a {\n comment "managed-by=lifecycle"\n}',
+        read=_nft,
+        errors=(LifecycleError,),
     ),
     "qdiscs of tc": Reader(good=_QDISCS, read=_qdiscs, errors=(ProgrammingError,)),
     "root qdisc of a device": Reader(

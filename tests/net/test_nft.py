@@ -13,7 +13,7 @@ import pytest
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import ChangeKind, Means, NotOursError, PrivilegeError
+from lifecycle.programming.target import ChangeKind, Means, ProgrammingError
 from lifecycle.programming.tool import HostTool
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
@@ -76,7 +76,7 @@ def test_the_table_is_there_marked_as_ours_and_a_second_apply_writes_nothing(ben
     assert [each.kind for each in again.changes] == [ChangeKind.KEEP]
     # Handles count up with each object that is made: equal ones are the same objects.
     assert bench.one.run("nft", "-a", "list", "table", "inet", "flowqos_robot") == handle
-    assert 'comment "managed-by=lifecycle digest=' in handle
+    assert 'comment "managed-by=lifecycle"' in handle
 
 
 def test_tables_of_others_are_untouched_and_only_ours_is_removed(bench: Bench) -> None:
@@ -127,7 +127,7 @@ def test_a_table_that_others_changed_is_noticed_and_replaced(bench: Bench) -> No
 
     assert (change.kind, change.detail) == (
         ChangeKind.UPDATE,
-        "the table was changed by others",
+        "the table is not as it was written",
     )
     assert bench.send(port=17900) == 0xB8
 
@@ -152,13 +152,13 @@ def test_a_table_of_this_name_that_is_not_ours_is_refused_and_stays(bench: Bench
     theirs = FOREIGN.replace("theirs", "flowqos_robot")
     bench.one.run("nft", "-f", "-", stdin=theirs)
 
-    for do in (lambda: bench.target.apply([flow(bench)]), bench.target.remove):
-        with pytest.raises(NotOursError) as caught:
-            do()
-        assert str(caught.value) == (
-            "cannot use nft table inet flowqos_robot: it exists and is not marked as managed by "
-            "lifecycle; look at it: nft list table inet flowqos_robot"
-        )
+    with pytest.raises(ProgrammingError) as caught:
+        bench.target.apply([flow(bench)])
+    assert str(caught.value) == (
+        "cannot use nft table inet flowqos_robot: it exists and is not marked as managed by "
+        "lifecycle; look at it: nft list table inet flowqos_robot"
+    )
+    assert bench.target.remove().changes == ()
     assert bench.one.run("nft", "list", "ruleset") == theirs
 
 
@@ -169,35 +169,29 @@ def test_no_flow_to_mark_means_no_table(bench: Bench) -> None:
 
     assert [each.kind for each in changes.changes] == [ChangeKind.DELETE]
     assert changes.left_out == (
-        "/video /camera → /viewer udp 198.51.100.7: it has no DSCP and no flow label to set",
+        "/video /camera → /viewer: it has no DSCP and no flow label to set",
     )
     assert bench.tables() == []
 
 
-def test_a_dry_run_is_checked_by_nft_and_writes_nothing(bench: Bench) -> None:
+def test_a_dry_run_writes_nothing(bench: Bench) -> None:
     text = bench.target.dry_run([flow(bench)])
 
     assert "add table inet flowqos_robot" in text
     assert bench.tables() == []
 
 
-def test_without_privilege_a_dry_run_is_checked_all_the_same_and_an_apply_says_what_it_needs(
-    bench: Bench,
-) -> None:
+def test_without_privilege_an_apply_says_what_it_needs(bench: Bench) -> None:
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
     tool = HostTool(bench.one.command(*nobody))
-    allowed = tool.run(["unshare", "-Urn", "true"]).returncode == 0
     target = NftTarget(None, Means(bench.ledger), tool)
 
-    text = target.dry_run([flow(bench)])
-    with pytest.raises(PrivilegeError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         target.apply([flow(bench)])
 
-    unchecked = text.startswith("# Not checked: this kernel allows no user namespaces.")
-    assert unchecked is not allowed
     assert str(caught.value) == (
-        "cannot read nft table inet flowqos_robot: 'nft list table inet flowqos_robot' needs "
-        "CAP_NET_ADMIN in this network namespace; run this command as root, or give it that "
+        "cannot read nft table inet flowqos_robot: 'nft -s list table inet flowqos_robot' "
+        "needs CAP_NET_ADMIN in this network namespace; run this command as root, or give it that "
         "capability: in a container --cap-add NET_ADMIN, in a systemd unit "
         "AmbientCapabilities=CAP_NET_ADMIN"
     )

@@ -13,16 +13,9 @@ import pytest
 
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import (
-    ChangeKind,
-    Means,
-    NotOursError,
-    PrivilegeError,
-    ProgrammingError,
-    TargetChanges,
-)
+from lifecycle.programming.target import ChangeKind, Means, ProgrammingError, TargetChanges
 from lifecycle.programming.tc import TcSettings, TcTarget
-from lifecycle.programming.tool import HostTool, ToolOutput
+from lifecycle.programming.tool import HostTool, Output
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
 
@@ -166,7 +159,7 @@ def test_a_table_that_others_changed_is_noticed_and_replaced(bench: Bench) -> No
 
     (change,) = target.apply([bench.rule()]).changes
 
-    assert (change.kind, change.detail) == (ChangeKind.UPDATE, "the table was changed by others")
+    assert (change.kind, change.detail) == (ChangeKind.UPDATE, "the table is not as it was written")
     bench.send(port=17900)
     assert bench.sent(EF) == 3
 
@@ -197,7 +190,7 @@ def test_a_root_qdisc_of_somebody_else_is_refused_and_stays(bench: Bench) -> Non
     bench.one.run("tc", "qdisc", "add", "dev", "e0", "root", "handle", "7:", "htb")
     before = everything(bench.one)
 
-    with pytest.raises(NotOursError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         bench.target().apply([bench.rule()])
 
     assert str(caught.value) == (
@@ -212,7 +205,7 @@ def test_two_systems_do_not_share_a_device(bench: Bench, tmp_path: Path) -> None
     bench.target().apply([bench.rule()])
     other = Bench(bench.one, bench.other, ledger_in(tmp_path, "arm"))
 
-    with pytest.raises(NotOursError, match="made by lifecycle, but not for system 'arm'"):
+    with pytest.raises(ProgrammingError, match="made by lifecycle, but not for system 'arm'"):
         other.target().apply([bench.rule()])
     other.target().remove()
 
@@ -243,7 +236,7 @@ def test_without_privilege_one_line_says_what_is_needed(
 
     # Looking needs no privilege.
     assert kinds(target.plan([bench.rule()])) == ["create"]
-    with pytest.raises(PrivilegeError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         target.apply([bench.rule()])
 
     assert str(caught.value) == (
@@ -283,7 +276,7 @@ class StopsAt:
         self._tool = HostTool(host.command())
         self._line = line
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         broken = stdin.replace(self._line, f"{self._line} nonsense", 1)
         return self._tool.run(argv, stdin=broken)
 

@@ -101,18 +101,18 @@ def test_a_system_programs_its_host_while_it_is_active_follows_its_flows_and_cle
             assert "dscp set ef" in listing(one)
             far.until("system", reached="active")
             port = video_port(near, other)
-            assert f". {port} " in listing(one)
+            assert f"udp dport {port} " in listing(one)
             far.signal(signal.SIGTERM)
             assert far.finish() == ExitCode.OK
         # The rule of a flow that is away for a moment harms nobody.
-        assert f". {port} " in listing(one)
+        assert f"udp dport {port} " in listing(one)
 
         with other.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
             taken.bind(("0.0.0.0", port))
             with up_on(other, manifest, "--machine", "b", runtime=tmp_path / "b") as far:
                 assert "1 updated" in programmed(near, 2)
-                assert f". {port} " not in listing(one)
-                assert f". {video_port(near, other)} " in listing(one)
+                assert f"udp dport {port} " not in listing(one)
+                assert f"udp dport {video_port(near, other)} " in listing(one)
                 far.until("system", reached="active")
                 near.signal(signal.SIGINT)
                 assert near.finish() == ExitCode.INTERRUPTED

@@ -52,7 +52,8 @@ from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.programming.programmer import Programmer, Treatment
+    from lifecycle.programming.programmer import Programmer
+    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen, TargetChanges
     from lifecycle.verify.verdict import Verdict
 
@@ -468,7 +469,7 @@ def _programming(function: F) -> F:
 
 @command.command("apply")
 @_programming
-@click.option("--dry-run", is_flag=True, help="Print what would be sent; check it if possible.")
+@click.option("--dry-run", is_flag=True, help="Print what would be sent.")
 def _apply(
     *,
     manifest: str,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.programmer import Treatment
+    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult

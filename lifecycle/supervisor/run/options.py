@@ -25,7 +25,7 @@ from lifecycle.verify.verdict import Verdict
 from lifecycle.verify.view import only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.programming.programmer import Treatment
+    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen
 
 

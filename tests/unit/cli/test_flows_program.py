@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.programming.programmer import read_treatment
-from lifecycle.programming.target import Chosen, MissingFeatureError, read_targets
+from lifecycle.programming.target import Chosen, ProgrammingError, read_targets
 from tests.builders import nfe
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import nef_settings, settings_file
@@ -102,7 +102,7 @@ def test_without_httpx_a_server_is_refused_by_the_name_of_the_extra(
     options = nef_options(tmp_path, "http://127.0.0.1:9")
     monkeypatch.setattr("lifecycle.programming.http.httpx", None)
 
-    with pytest.raises(MissingFeatureError) as caught:
+    with pytest.raises(ProgrammingError) as caught:
         flows_verb.apply(plan(), [report()], options, dry_run=False)
 
     assert str(caught.value) == (

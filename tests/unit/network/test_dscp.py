@@ -20,7 +20,7 @@ def test_the_table_holds_the_24_code_points_in_rising_order_each_with_its_rfc() 
     assert ", ".join(each.name for each in code_points()) == NAMES
     assert len(numbers) == 24
     assert numbers == sorted(set(numbers))
-    assert all(each.rfc.startswith("RFC ") and each.phb and each.nft for each in code_points())
+    assert all(each.rfc.startswith("RFC ") and each.phb for each in code_points())
 
 
 @pytest.mark.parametrize("selector", range(8))

@@ -5,13 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import (
-    ChangeKind,
-    FlowChange,
-    ProgrammingError,
-    TargetChanges,
-)
-from lifecycle.programming.tool import ToolOutput
+from lifecycle.programming.target import ChangeKind, FlowChange, ProgrammingError, TargetChanges
+from lifecycle.programming.tool import Output
 
 
 class FakeTarget:
@@ -60,19 +55,24 @@ class FakeTool:
         lines: every command line, joined by spaces.
     """
 
-    def __init__(self, *answers: tuple[str, ToolOutput | Callable[[], ToolOutput]]) -> None:
+    def __init__(self, *answers: tuple[str, Output | Callable[[], Output]]) -> None:
         self.answers = dict(answers)
         self.lines: list[str] = []
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         line = " ".join(argv)
         self.lines.append(line)
         for begins, answer in self.answers.items():
             if line.startswith(begins):
-                return answer if isinstance(answer, ToolOutput) else answer()
-        return ToolOutput(returncode=0, stdout="", stderr="")
+                return answer() if callable(answer) else answer
+        return printed("")
 
 
-def failed(stderr: str, returncode: int = 1) -> ToolOutput:
+def printed(stdout: str) -> Output:
+    """What a program that succeeded leaves."""
+    return Output((), 0, stdout, "")
+
+
+def failed(stderr: str) -> Output:
     """What a program that failed leaves."""
-    return ToolOutput(returncode=returncode, stdout="", stderr=stderr)
+    return Output((), 1, "", stderr)

@@ -10,10 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Machine, UniqueHow
-from lifecycle.network.nfe import (
-    TransportProtocol,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 from lifecycle.plan.model import Plan
 from lifecycle.programming.rules import FlowRule
 from lifecycle.verify.outcome import Outcome

@@ -95,7 +95,7 @@ class Server:
             def do(self) -> None:
                 outer._serve(self)
 
-            do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = do  # noqa: N815
+            do_GET = do_POST = do_PUT = do_DELETE = do  # noqa: N815
 
             def log_message(self, *_: object) -> None:
                 pass
@@ -169,7 +169,6 @@ class NefServer(Server):
     Attributes:
         subscriptions: by id.
         absolute_locations: Location as some gateways write it: with a host nobody can reach.
-        knows_patch: PATCH is implemented.
         deletes_with_200: as some servers answer.
     """
 
@@ -177,7 +176,6 @@ class NefServer(Server):
         super().__init__()
         self.subscriptions: dict[str, dict[str, Any]] = {}
         self.absolute_locations = False
-        self.knows_patch = True
         self.deletes_with_200 = False
         self._next = 1
 
@@ -210,16 +208,9 @@ class NefServer(Server):
         if asked.method == "DELETE":
             del self.subscriptions[id_]
             return Answer(200, {}) if self.deletes_with_200 else Answer(204)
-        if asked.method == "PATCH":
-            if not self.knows_patch:
-                return _problem(405, "METHOD_NOT_ALLOWED")
-            if asked.headers["content-type"] != "application/merge-patch+json":
-                self.complaints.append(f"PATCH as {asked.headers['content-type']}")
-            if set(asked.body) - {"notificationDestination", "flowInfo", "qosReference"}:
-                self.complaints.append(f"PATCH of {sorted(asked.body)}")
-            found.update(asked.body)
-            return Answer(204)
         self._check(asked.body, asked)
+        if any(found.get(key) != asked.body.get(key) for key in ("ueIpv4Addr", "ueIpv6Addr")):
+            self.complaints.append(f"PUT of another device: {asked.body}")
         self.subscriptions[id_] = {**asked.body, "self": found["self"]}
         return Answer(200, self.subscriptions[id_])
 

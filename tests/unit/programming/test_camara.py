@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.target import (
@@ -17,12 +18,7 @@ from lifecycle.programming.target import (
     TargetChanges,
     read_targets,
 )
-from tests.unit.programming.samples import (
-    camara_settings,
-    ledger_in,
-    rule,
-    settings_file,
-)
+from tests.unit.programming.samples import camara_settings, ledger_in, rule, settings_file
 from tests.unit.programming.servers import TOKEN, Answer, Asked, CamaraServer, Clock
 
 
@@ -229,7 +225,7 @@ def test_a_renewal_that_fails_says_which_flow_will_lose_its_session(bench: Bench
 def test_somebody_elses_session_for_the_same_flow_is_an_error_and_stays(bench: Bench) -> None:
     target = bench.make()
     target.apply([rule()])
-    bench.ledger.drop(bench.ledger.read().targets[0])
+    bench.ledger.put(replace(bench.ledger.read().targets[0], entries=()))
 
     with pytest.raises(PartlyError, match="409 Conflict: CONFLICT: no: conflict"):
         target.apply([rule()])

@@ -9,10 +9,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement
-from lifecycle.network.nfe import (
-    InternetProtocol,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
 from lifecycle.programming.flows_csv import COLUMNS, flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport

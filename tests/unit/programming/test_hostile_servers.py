@@ -11,16 +11,16 @@ import socket
 import struct
 import threading
 import time
-import tracemalloc
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from lifecycle.errors import BringUpError
-from lifecycle.programming.http import Api, Patience
+from lifecycle.programming.http import Api
+from lifecycle.programming.patience import Patience
 from lifecycle.programming.programmer import Programmer
+from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import (
     HttpError,
     Means,
@@ -200,25 +200,10 @@ HOSTILE: dict[str, tuple[str, Behave, str]] = {
         floods(b"HTTP/1.1 201 Created\r\n\r\n", b" " * 65536),
         "characters of JSON; at most 4194304 are read",
     ),
-    "bad gzip": (
+    "gzip, which is not asked for": (
         "nef",
-        answers(b"no", content_encoding="gzip"),
-        "no HTTP that can be read (error)",
-    ),
-    "half gzip": (
-        "camara",
-        answers(gzip.compress(b" " * 999)[:-9], content_encoding="gzip"),
-        "its body: ",
-    ),
-    "a gzip bomb": (
-        "camara",
         answers(gzip.compress(b" " * 99_000_000), content_encoding="gzip"),
-        "characters of JSON; at most 4194304 are read",
-    ),
-    "gzip in gzip": (
-        "camara",
-        answers(b"{}", content_encoding="gzip, gzip"),
-        "no HTTP that can be read (DecodingError)",
+        "it is packed, which was not asked for",
     ),
     "deep JSON": ("camara", answers(DEEP), "its body: "),
     "no JSON": ("camara", answers(b"<html>"), "its body: JSON is malformed"),
@@ -318,31 +303,6 @@ def test_every_hostile_answer_is_one_clear_error_in_time(name: str, tmp_path: Pa
     assert all(each.isprintable() for each in text.splitlines())
     assert len(text) < 1000
     assert TOKEN not in text
-
-
-def test_of_a_gzip_bomb_no_more_is_unpacked_than_an_answer_may_have() -> None:
-    bomb = gzip.compress(b" " * 200_000_000)
-    with HostileServer(answers(bomb, "200 OK", content_encoding="gzip")) as server:
-        api = Api(server.url, patience=Patience(attempts=1))
-        tracemalloc.start()
-        try:
-            reply = api.request("GET", "/sessions")
-            _, peak_bytes = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
-
-    assert len(reply.body) == 4 * 1024 * 1024 + 1
-    # The body, its copy into the reply and what both grew from.
-    assert peak_bytes < 24 * 1024 * 1024
-
-
-@pytest.mark.parametrize(("coding", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress)])
-def test_an_answer_that_is_packed_though_not_asked_to_be_is_read(
-    coding: str, pack: Callable[[bytes], bytes], tmp_path: Path
-) -> None:
-    packed = answers(pack(json.dumps(SESSION).encode()), content_encoding=coding)
-    with HostileServer(packed) as server, target_at(tmp_path, "camara", server) as (target, _):
-        target.apply([rule()])
 
 
 @pytest.mark.parametrize(
@@ -524,11 +484,14 @@ class TestProxies:
         "proxy", ["socks5://127.0.0.1:1", "gopher://me:hunter2@x", "http://:0x"]
     )
     def test_a_proxy_that_cannot_be_used_is_one_clear_error(
-        self, proxy: str, monkeypatch: pytest.MonkeyPatch
+        self, proxy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("ALL_PROXY", proxy)
         with pytest.raises(SettingsError) as caught:
-            Api("https://nef.example.net")
+            Api(
+                ServerSettings(url="https://nef.example.net", devices=("10.45.0.0/16",)),
+                Means(ledger_in(tmp_path)),
+            )
 
         assert str(caught.value) == (
             "cannot reach https://nef.example.net through the proxy that the environment names: "

@@ -81,10 +81,9 @@ def test_a_flow_between_two_devices_is_asked_for_once_for_each() -> None:
 def test_servers_differ_in_how_they_want_what_a_device_sends(
     change: dict[str, object], text: str
 ) -> None:
-    for devices in ((ROBOT,), ("source",)):
-        (request,) = nef_subscriptions([VIDEO], nef(devices=devices, **change)).requests
-        assert filters(request.body) == [text]
-        assert request.body["ueIpv4Addr"] == ROBOT
+    (request,) = nef_subscriptions([VIDEO], nef(devices=(ROBOT,), **change)).requests
+    assert filters(request.body) == [text]
+    assert request.body["ueIpv4Addr"] == ROBOT
 
 
 @pytest.mark.parametrize(
@@ -97,10 +96,7 @@ def test_servers_differ_in_how_they_want_what_a_device_sends(
         ({"five_qi": 9}, "the operator's name for 5QI 9 is not known; add it to qos_references"),
         (
             {"five_qi": None},
-            (
-                "it asks for no 5QI (EF = DSCP 46 = TOS 184 (0xb8), at most 5 ms), "
-                "and there is no default class"
-            ),
+            "it asks for no 5QI (EF = DSCP 46 = TOS 184 (0xb8), at most 5 ms)",
         ),
         (
             {"destination_address": "10.9.0.3"},
@@ -117,13 +113,6 @@ def test_what_cannot_be_asked_for_is_named_with_its_reason(
 ) -> None:
     changed = replace(VIDEO, **change)
     assert reasons(nef_subscriptions([changed], nef())) == [reason]
-
-
-def test_a_default_class_takes_what_has_no_name() -> None:
-    settings = nef(default_qos_reference="best")
-    changed = replace(VIDEO, five_qi=9)
-    (request,) = nef_subscriptions([changed], settings).requests
-    assert request.body["qosReference"] == "best"
 
 
 def test_the_export_says_what_each_body_is_for() -> None:
@@ -153,8 +142,7 @@ def test_the_camara_export_says_what_each_body_is_for() -> None:
             lambda: nef(devices=()),
             (
                 "cannot tell which ends of flows are devices: devices is empty; name the "
-                "addresses or networks of the devices, such as 10.45.0.0/16, or 'source' or "
-                "'destination'"
+                "addresses or networks of the devices, such as 10.45.0.0/16"
             ),
         ),
         (
@@ -165,7 +153,7 @@ def test_the_camara_export_says_what_each_body_is_for() -> None:
             ),
         ),
         (
-            lambda: camara(default_qos_profile="x"),
+            lambda: camara(qos_profiles={85: "x"}),
             (
                 "cannot use qosProfile 'x'; "
                 "use 3 to 256 letters, digits, '_', '.' and '-', such as QOS_E"

@@ -20,12 +20,7 @@ from lifecycle.programming.target import (
     TargetChanges,
     read_targets,
 )
-from tests.unit.programming.samples import (
-    ledger_in,
-    nef_settings,
-    rule,
-    settings_file,
-)
+from tests.unit.programming.samples import ledger_in, nef_settings, rule, settings_file
 from tests.unit.programming.servers import TOKEN, Answer, Clock, NefServer
 
 PROBLEM = "application/problem+json"
@@ -101,26 +96,16 @@ def test_a_plan_says_what_would_be_done_and_does_none_of_it(bench: Bench) -> Non
     assert bench.server.asked == []
 
 
-def test_a_port_that_changed_is_patched_into_the_same_subscription(bench: Bench) -> None:
+def test_a_port_that_changed_is_put_into_the_same_subscription(bench: Bench) -> None:
     bench.target.apply([rule(port=17900)])
 
     changes = bench.target.apply([rule(port=18000)])
 
     assert kinds(changes) == ["update"]
-    assert bench.server.methods() == ["POST", "GET", "PATCH"]
+    assert bench.server.methods() == ["POST", "GET", "PUT"]
     assert list(bench.server.subscriptions) == ["sub-1"]
     (flow,) = bench.server.subscriptions["sub-1"]["flowInfo"]
     assert flow["flowDescriptions"] == ["permit in 17 from 10.45.0.3 18000 to 198.51.100.7 17910"]
-
-
-def test_a_server_without_patch_gets_the_whole_by_put(bench: Bench) -> None:
-    bench.server.knows_patch = False
-    bench.target.apply([rule(port=17900)])
-
-    bench.target.apply([rule(port=18000)])
-
-    assert bench.server.methods() == ["POST", "GET", "PATCH", "PUT"]
-    assert "18000" in str(bench.server.subscriptions["sub-1"])
 
 
 def test_a_device_that_changed_its_address_needs_another_subscription(bench: Bench) -> None:
@@ -319,7 +304,7 @@ def test_the_token_is_in_requests_and_nowhere_else(
 ) -> None:
     caplog.set_level(logging.DEBUG)
     bench.target.apply([rule()])
-    bench.server.failures = [("PATCH", Answer(401, None))]
+    bench.server.failures = [("PUT", Answer(401, None))]
 
     with pytest.raises(PartlyError) as caught:
         bench.target.apply([rule(port=18000)])

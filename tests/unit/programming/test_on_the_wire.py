@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.nft import render_nft
-from lifecycle.programming.tc import TcMatch, TcSettings, render_tc
+from lifecycle.programming.nft import NftTarget
+from lifecycle.programming.rules import RuleSet
+from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget
 from tests.unit.programming.flow_samples import in_a_network_namespace, rule
 
 RULES = (
@@ -57,7 +58,9 @@ def run(script: str, needs: str) -> str:
 def test_marked_flows_carry_their_dscp_keep_their_ecn_and_others_stay_as_they_are(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "nft").write_text(render_nft(RULES, system="wire"), encoding="utf-8")
+    (tmp_path / "nft").write_text(
+        NftTarget.export(None, RuleSet(rules=RULES), "wire"), encoding="utf-8"
+    )
     (tmp_path / "send.py").write_text(SENDER, encoding="utf-8")
     out = run(
         f"""set -e
@@ -74,7 +77,7 @@ nft list chain inet flowqos_wire post""",
         "127.0.0.1 17919": ECT_0,
         "::1 17919": ECT_0,
     }
-    assert re.findall(r'packets (\d+) bytes \d+ comment "(.*?)"', chain) == [
+    assert re.findall(r'packets (\d+) bytes \d+ comment "(.*?): /', chain) == [
         ("1", "EF = DSCP 46 = TOS 184 (0xb8)"),
         ("1", "LE = DSCP 1 = TOS 4 (0x04)"),
         ("1", "NQB = DSCP 45 = TOS 180 (0xb4)"),
@@ -87,8 +90,12 @@ def test_each_flow_goes_to_its_class_and_the_rest_to_the_rest(
     tmp_path: Path, match: TcMatch
 ) -> None:
     settings = TcSettings(device="lo", link_kbit=100_000, match=match)
-    (tmp_path / "tc").write_text(render_tc(RULES, settings, system="wire"), encoding="utf-8")
-    (tmp_path / "nft").write_text(render_nft(RULES, system="wire"), encoding="utf-8")
+    (tmp_path / "tc").write_text(
+        TcTarget.export(settings, RuleSet(rules=RULES), "wire"), encoding="utf-8"
+    )
+    (tmp_path / "nft").write_text(
+        NftTarget.export(None, RuleSet(rules=RULES), "wire"), encoding="utf-8"
+    )
     (tmp_path / "send.py").write_text(SENDER, encoding="utf-8")
     # Marks are set before packets are queued, so nft and tc work together on one host.
     out = run(

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan.model import PlannedNode
-from lifecycle.programming.rules import FlowRule, asks, flow_rules, named
+from lifecycle.programming.rules import FlowRule, Treatment, asks, flow_rules, named
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 from tests.builders import nfe
@@ -167,19 +167,19 @@ def test_a_mapping_gives_the_dscp_where_only_a_5qi_is_asked_for() -> None:
     only_5qi = replace(bare, nodes=(changed, *bare.nodes[1:]))
     assert only(report(), plan=only_5qi).dscp is None
     mapping = dscp_mapping("azure_private_5g_core")
-    assert only(report(), plan=only_5qi, mapping=mapping).dscp == 18
-    assert only(report(), mapping=mapping).dscp == 46
+    assert only(report(), plan=only_5qi, treatment=Treatment(mapping=mapping)).dscp == 18
+    assert only(report(), treatment=Treatment(mapping=mapping)).dscp == 46
 
 
 def test_flow_labels_are_given_to_ipv6_only_and_stay_with_the_5_tuple() -> None:
     v6 = report(source=(nfe("::", 45000),), destination=(nfe("fd09::2", 7001),))
-    label = only(v6, label_flows=True).flow_label
+    label = only(v6, treatment=Treatment(label_flows=True)).flow_label
     assert 1 <= label <= 0xFFFFF
-    assert only(v6, label_flows=True).flow_label == label
+    assert only(v6, treatment=Treatment(label_flows=True)).flow_label == label
     assert only(v6).flow_label == 0
-    assert only(report(), label_flows=True).flow_label == 0
+    assert only(report(), treatment=Treatment(label_flows=True)).flow_label == 0
     moved = replace(v6, destination=(nfe("fd09::2", 7002),))
-    assert only(moved, label_flows=True).flow_label != label
+    assert only(moved, treatment=Treatment(label_flows=True)).flow_label != label
 
 
 @pytest.mark.parametrize(

@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
-from lifecycle.programming.tc import (
-    TcMatch,
-    TcSettings,
-    class_of,
-    classes_of,
-    divide,
-    render_tc,
-    render_tc_removal,
-)
-from tests.unit.programming.flow_samples import (
-    EXPECTED,
-    LEFT_OUT,
-    RULES,
-    VIDEO,
-    in_a_network_namespace,
-)
+from lifecycle.programming.rules import RuleSet
+from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget, class_of, classes_of, divide
+from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO
 
 
 def settings(**rest: object) -> TcSettings:
@@ -42,37 +28,12 @@ def cannot(message: str) -> object:
 
 
 def script(case: TcSettings) -> str:
-    return render_tc(RULES, case, system="teleop", left_out=LEFT_OUT)
+    return TcTarget.export(case, RuleSet(rules=RULES, left_out=LEFT_OUT), "teleop")
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_script_makes_a_class_per_dscp_or_5qi_and_puts_each_flow_into_one(name: str) -> None:
     assert script(CASES[name]) == (EXPECTED / f"{name}.sh").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("match", TcMatch)
-def test_tc_and_nft_take_the_script_once_and_remove_it_whole(
-    tmp_path: Path, match: TcMatch
-) -> None:
-    case = TcSettings(device="lo", link_kbit=20_000, match=match)
-    (tmp_path / "made").write_text(script(case), encoding="utf-8")
-    (tmp_path / "gone").write_text(render_tc_removal("lo"), encoding="utf-8")
-    text = f"""cd {tmp_path}
-tc qdisc add dev lo root handle 1: htb || exit 77
-set -e
-tc qdisc del dev lo root
-sh made; tc class show dev lo > shown; nft list table inet flowtc_lo_teleop >> shown
-if sh made 2>&1; then exit 1; fi
-tc -batch gone; tc qdisc show dev lo
-if tc -batch gone 2>&1; then exit 1; fi"""
-    done = in_a_network_namespace("sh", "-c", text, needs="nft")
-    if done.returncode == 77:
-        pytest.skip(f"this kernel has no htb: {done.stderr.strip()}")
-    assert done.returncode == 0, done.stderr
-    shown = (tmp_path / "shown").read_text(encoding="utf-8")
-    classes = set(re.findall(r"class htb (1f10:\w+)", shown))
-    assert set(re.findall(r"meta priority set (1f10:\w+)", shown)) < classes
-    assert "1f10:" not in done.stdout
 
 
 def test_ef_comes_first_and_less_than_best_effort_last() -> None:
@@ -96,10 +57,15 @@ def test_a_rule_without_dscp_and_5qi_and_one_of_df_stay_with_the_rest() -> None:
 
 def test_a_link_is_divided_without_remainder_lost_or_spent_twice() -> None:
     classes = classes_of(RULES)
-    rates, rest = divide(classes, link_kbit=20_000, guaranteed_kbit={"ef": 4000})
-    assert rates == {"ef": 4000, "nqb": 3950, "dscp5": 3950, "5qi9": 3950, "le": 200}
-    assert rest == 3950
-    assert sum(rates.values()) + rest <= 20_000
+    rates = divide(classes, link_kbit=20_001, guaranteed_kbit={"ef": 4000})
+    assert [(each.name, rate) for each, rate in rates.items()] == [
+        ("ef", 4000),
+        ("nqb", 3950),
+        ("dscp5", 3950),
+        ("5qi9", 3950),
+        ("everything else", 3951),
+        ("le", 200),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from lifecycle.programming.programmer import open_programmer
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
-    PrivilegeError,
+    ProgrammingError,
     TargetChanges,
     read_targets,
 )
@@ -59,7 +59,7 @@ class FakePrograms:
         if self.fail:
             self.fail -= 1
             self._loop.call_soon_threadsafe(self.asked.set)
-            raise PrivilegeError(
+            raise ProgrammingError(
                 "cannot write nft table inet flowqos_s: 'nft -f -' needs CAP_NET_ADMIN in this "
                 "network namespace",
                 hint="run this command as root",

@@ -33,45 +33,15 @@ nft -f - <<'END'
 add table inet flowtc_eth0_teleop
 delete table inet flowtc_eth0_teleop
 table inet flowtc_eth0_teleop {
-  comment "managed-by=lifecycle digest=6a9fd6e11f6b3be8 classes=7dab5362318e1e3c"
-  set f4_ef {
-    typeof ip saddr . udp sport . ip daddr . udp dport
-    elements = {
-      10.9.0.1 . 17900 . 10.9.0.2 . 17910 comment "/video /robot/camera → /viewer",
-      10.9.0.1 . 17901 . 10.9.0.2 . 17911 comment "/depth /robot/camera → /viewer",
-    }
-  }
-  set p4_le {
-    typeof udp sport . ip daddr . udp dport
-    elements = {
-      17900 . 10.9.0.2 . 17912 comment "/bulk /robot/camera → /viewer",
-    }
-  }
-  set f4_tcp_dscp5 {
-    typeof ip saddr . tcp sport . ip daddr . tcp dport
-    elements = {
-      10.9.0.1 . 17903 . 10.9.0.2 . 17913 comment "/log /robot/camera → /viewer",
-    }
-  }
-  set f6_nqb {
-    typeof ip6 saddr . udp sport . ip6 daddr . udp dport
-    elements = {
-      fd09::1 . 17904 . fd09::2 . 17914 comment "/lidar /robot/camera → /viewer",
-    }
-  }
-  set f4_5qi9 {
-    typeof ip saddr . udp sport . ip daddr . udp dport
-    elements = {
-      10.9.0.1 . 17905 . 10.9.0.2 . 17915 comment "/touch /robot/camera → /viewer",
-    }
-  }
+  comment "managed-by=lifecycle"
   chain post {
     type filter hook postrouting priority -149; policy accept;
-    oifname "eth0" ip saddr . udp sport . ip daddr . udp dport @f4_ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
-    oifname "eth0" udp sport . ip daddr . udp dport @p4_le meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
-    oifname "eth0" ip saddr . tcp sport . ip daddr . tcp dport @f4_tcp_dscp5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
-    oifname "eth0" ip6 saddr . udp sport . ip6 daddr . udp dport @f6_nqb meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
-    oifname "eth0" ip saddr . udp sport . ip daddr . udp dport @f4_5qi9 meta priority set 1f10:209 counter comment "5QI 9 (Non-GBR)"
+    oifname "eth0" ip saddr 10.9.0.1 udp sport 17900 ip daddr 10.9.0.2 udp dport 17910 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8): /video /robot/camera → /viewer"
+    oifname "eth0" ip saddr 10.9.0.1 udp sport 17901 ip daddr 10.9.0.2 udp dport 17911 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8): /depth /robot/camera → /viewer"
+    oifname "eth0" udp sport 17900 ip daddr 10.9.0.2 udp dport 17912 meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04): /bulk /robot/camera → /viewer"
+    oifname "eth0" ip saddr 10.9.0.1 tcp sport 17903 ip daddr 10.9.0.2 tcp dport 17913 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14): /log /robot/camera → /viewer"
+    oifname "eth0" ip6 saddr fd09::1 udp sport 17904 ip6 daddr fd09::2 udp dport 17914 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4): /lidar /robot/camera → /viewer"
+    oifname "eth0" ip saddr 10.9.0.1 udp sport 17905 ip daddr 10.9.0.2 udp dport 17915 meta priority set 1f10:209 counter comment "5QI 9 (Non-GBR): /touch /robot/camera → /viewer"
   }
 }
 END

@@ -12,19 +12,16 @@ tc -batch - <<'END'
 qdisc add dev eth0 root handle 1f10: htb default 0xfff
 class replace dev eth0 parent 1f10: classid 1f10:1 htb rate 20000kbit ceil 20000kbit quantum 3028
 # class 1f10:12e: EF = DSCP 46 = TOS 184 (0xb8)
-class replace dev eth0 parent 1f10:1 classid 1f10:12e htb rate 3960kbit ceil 20000kbit prio 0 quantum 3028
+class replace dev eth0 parent 1f10:1 classid 1f10:12e htb rate 4950kbit ceil 20000kbit prio 0 quantum 3028
 qdisc replace dev eth0 parent 1f10:12e handle 212e: bfifo limit 125000
 # class 1f10:12d: NQB = DSCP 45 = TOS 180 (0xb4)
-class replace dev eth0 parent 1f10:1 classid 1f10:12d htb rate 3960kbit ceil 20000kbit prio 1 quantum 3028
+class replace dev eth0 parent 1f10:1 classid 1f10:12d htb rate 4950kbit ceil 20000kbit prio 1 quantum 3028
 qdisc replace dev eth0 parent 1f10:12d handle 212d: bfifo limit 125000
 # class 1f10:105: DSCP 5 = TOS 20 (0x14)
-class replace dev eth0 parent 1f10:1 classid 1f10:105 htb rate 3960kbit ceil 20000kbit prio 2 quantum 3028
+class replace dev eth0 parent 1f10:1 classid 1f10:105 htb rate 4950kbit ceil 20000kbit prio 2 quantum 3028
 qdisc replace dev eth0 parent 1f10:105 handle 2105: bfifo limit 125000
-# class 1f10:209: 5QI 9 (Non-GBR)
-class replace dev eth0 parent 1f10:1 classid 1f10:209 htb rate 3960kbit ceil 20000kbit prio 3 quantum 3028
-qdisc replace dev eth0 parent 1f10:209 handle 2209: bfifo limit 125000
 # class 1f10:fff: everything else
-class replace dev eth0 parent 1f10:1 classid 1f10:fff htb rate 3960kbit ceil 20000kbit prio 6 quantum 3028
+class replace dev eth0 parent 1f10:1 classid 1f10:fff htb rate 4950kbit ceil 20000kbit prio 6 quantum 3028
 qdisc replace dev eth0 parent 1f10:fff handle 2fff: bfifo limit 125000
 # class 1f10:101: LE = DSCP 1 = TOS 4 (0x04)
 class replace dev eth0 parent 1f10:1 classid 1f10:101 htb rate 200kbit ceil 20000kbit prio 7 quantum 3028
@@ -34,17 +31,17 @@ nft -f - <<'END'
 add table inet flowtc_eth0_teleop
 delete table inet flowtc_eth0_teleop
 table inet flowtc_eth0_teleop {
-  comment "managed-by=lifecycle digest=e269a6f6d036216f classes=55ff2a037a3acb19"
+  comment "managed-by=lifecycle"
   chain post {
     type filter hook postrouting priority -149; policy accept;
-    oifname "eth0" ip dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
-    oifname "eth0" ip6 dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip dscp 46 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+    oifname "eth0" ip6 dscp 46 meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+    oifname "eth0" ip dscp 1 meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip6 dscp 1 meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
     oifname "eth0" ip dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
     oifname "eth0" ip6 dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
     oifname "eth0" ip dscp 45 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
     oifname "eth0" ip6 dscp 45 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
-    oifname "eth0" ip dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
-    oifname "eth0" ip6 dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
   }
 }
 END

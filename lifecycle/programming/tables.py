@@ -1,0 +1,309 @@
+"""nftables tables of ours on this host, and what the targets that keep one have in common.
+
+Owns: the text of a table for `nft -f`, and `TableTarget`, which writes, compares and removes one. A
+table is replaced as a whole in one transaction, so no foreign object is ever touched; its comment
+says that it is ours. The ledger has what was written for each flow, and a digest of what nft showed
+afterwards: what differs from that was changed by others. Needs nftables 1.0.6 or later.
+"""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+from msgspec.structs import replace
+
+from lifecycle.errors import UsageError
+from lifecycle.network.nfe import InternetProtocol
+from lifecycle.programming.ledger import Entry, TargetRecord
+from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed, named
+from lifecycle.programming.target import (
+    ChangeKind,
+    FlowChange,
+    Means,
+    ProgrammingError,
+    Target,
+    TargetChanges,
+    describe_rule,
+)
+from lifecycle.programming.tool import HostTool, demand, failure
+
+MAX_COMMENT_BYTES = 127
+"""Longest comment that nftables keeps (NFTNL_UDATA_COMMENT_MAXLEN, with its final zero 128)."""
+
+_MANAGED = "managed-by=lifecycle"
+_SYSTEM = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_NONE_SUCH = re.compile(r"No such file or directory", re.IGNORECASE)
+
+
+def table_name(system: str, prefix: str = "flowqos") -> str:
+    """Return the name of a system's table, `flowqos_teleop`.
+
+    Raises:
+        UsageError: the system's name is not one that a manifest may have.
+    """
+    if not _SYSTEM.fullmatch(system):
+        raise UsageError(
+            f"cannot name an nftables table after system {system!r}; "
+            f"use letters, digits, '_' and '-', a letter first"
+        )
+    return f"{prefix}_{system}"
+
+
+def network_of(rule: FlowRule) -> str:
+    """Return how nft calls the family of a rule."""
+    return "ip6" if rule.internet_protocol is InternetProtocol.IPV6 else "ip"
+
+
+def flow_match(rule: FlowRule) -> str:
+    """Return what matches the packets of a rule; without its source address where none is known."""
+    network, transport = network_of(rule), rule.transport_protocol.value
+    source = f"{network} saddr {rule.source_address} " if rule.source_address else ""
+    return (
+        f"{source}{transport} sport {rule.source_port} "
+        f"{network} daddr {rule.destination_address} {transport} dport {rule.destination_port}"
+    )
+
+
+def chain_line(match: str, statement: str, comment: str) -> str:
+    """Return one line of a chain, which counts the packets that it matches."""
+    return f'{match} {statement} counter comment "{_fitting(comment)}"'
+
+
+def _fitting(comment: str) -> str:
+    """Text that fits between quotes and into a comment; what is cut off ends with dots."""
+    plain = " ".join(comment.replace('"', "'").split())
+    encoded = plain.encode()
+    if len(encoded) <= MAX_COMMENT_BYTES:
+        return plain
+    return encoded[: MAX_COMMENT_BYTES - 3].decode(errors="ignore") + "..."
+
+
+def render_table(table: str, lines: Iterable[str], *, priority: str = "mangle") -> str:
+    """Return commands for `nft -f` that replace a table in one transaction.
+
+    Args:
+        table: its name.
+        lines: of its chain.
+        priority: of its chain in the postrouting hook.
+    """
+    text = [
+        f"table inet {table} {{",
+        f'  comment "{_MANAGED}"',
+        "  chain post {",
+        f"    type filter hook postrouting priority {priority}; policy accept;",
+        *(f"    {each}" for each in dict.fromkeys(lines)),
+        "  }",
+        "}",
+    ]
+    return render_table_removal(table) + "\n".join(text) + "\n"
+
+
+def render_table_removal(table: str) -> str:
+    """Return commands for `nft -f` that remove a table, and do so if there is none."""
+    # `destroy` would say it in one line, but nftables 1.0.6 does not know the keyword.
+    return f"add table inet {table}\ndelete table inet {table}\n"
+
+
+Placed = Sequence[tuple[FlowRule, Sequence[str]]]
+"""Rules, each with its lines of a chain."""
+
+
+class Wanted(NamedTuple):
+    """What the host is to have for some rules.
+
+    Attributes:
+        table: for `nft -f`.
+        beside: for `tc -batch`, what is made before the table; empty if nothing is.
+    """
+
+    table: str
+    beside: str = ""
+
+
+class TableTarget(Target):
+    """A table of one system, and what is beside it; both are written and removed as a whole.
+
+    Args:
+        settings: of the target.
+        means: their ledger says what was written, for who compares or removes it later.
+        table: its name.
+        scope: names it in the ledger.
+        tool: runs nft, and tc.
+
+    Attributes:
+        gone: detail of a change because what was written is not there any more.
+    """
+
+    gone: ClassVar[str] = "the table was gone"
+
+    def __init__(
+        self, settings: Any, means: Means, tool: HostTool | None, *, table: str, scope: str
+    ) -> None:
+        super().__init__(settings, means)
+        self._tool = tool or HostTool()
+        self._table = table
+        self._record = TargetRecord(target=self.kind, scope=scope)
+
+    @staticmethod
+    @abc.abstractmethod
+    def lines(rule: FlowRule, settings: Any) -> Sequence[str]:
+        """Return the lines of a chain for a rule.
+
+        Raises:
+            ValueError: there are none, with the reason.
+        """
+
+    @staticmethod
+    @abc.abstractmethod
+    def wanted(placed: Placed, settings: Any, system: str) -> Wanted:
+        """Return what the host is to have.
+
+        Raises:
+            ValueError: it cannot be had.
+        """
+
+    @staticmethod
+    @abc.abstractmethod
+    def script(wanted: Wanted, remarks: Sequence[str], settings: Any, system: str) -> str:
+        """Return the same as a file for people, with these lines of comments."""
+
+    def found(self) -> str:
+        """Return what is there of ours, as the host shows it; empty if nothing is.
+
+        Raises:
+            ProgrammingError: an object of this name is not ours, or may not be read.
+        """
+        return self.listing()
+
+    def write(self, wanted: Wanted, *, anew: bool) -> None:  # noqa: ARG002 - for what is beside it
+        """Write it; `anew` if nothing of it is there, or what is beside the table changes."""
+        self.write_table(wanted.table)
+
+    def clear(self) -> bool:
+        """Remove what is there of ours; return whether there was anything."""
+        there = bool(self.listing())
+        if there:
+            self.write_table(render_table_removal(self._table))
+        return there
+
+    def listing(self) -> str:
+        """Return the table as nft shows it, without counts; empty if there is none.
+
+        Raises:
+            ProgrammingError: a table of this name is not ours, or may not be read.
+        """
+        argv = ["nft", "-s", "list", "table", "inet", self._table]
+        table = f"nft table inet {self._table}"
+        output = self._tool.run(argv)
+        if output.returncode != 0:
+            if _NONE_SUCH.search(output.stderr):
+                return ""
+            raise failure(output, argv, doing=f"read {table}")
+        if _MANAGED not in output.stdout:
+            raise ProgrammingError(
+                f"cannot use {table}: it exists and is not marked as managed by lifecycle",
+                hint=f"look at it: nft list table inet {self._table}",
+            )
+        return output.stdout
+
+    def write_table(self, text: str) -> None:
+        """Have nft take a ruleset, whole or not at all."""
+        doing = f"write nft table inet {self._table}"
+        demand(self._tool, ["nft", "-f", "-"], doing=doing, stdin=text)
+
+    @classmethod
+    def export(cls, settings: Any, rules: RuleSet, system: str) -> str:
+        """Return a file that programs a host, and says in comments what is left out of it."""
+        placed, left_out = expressed(rules.rules, lambda rule: cls.lines(rule, settings))
+        remarks = [f"# {named(each)}: {each.describe()}: {asks(each)}" for each in rules.rules]
+        remarks += [f"# left out: {each}" for each in (*rules.left_out, *left_out)]
+        return cls.script(cls.wanted(placed, settings, system), remarks, settings, system)
+
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Compare what was written, and what is there, with the rules.
+
+        Raises:
+            ProgrammingError: what is there is not ours, or may not be read.
+        """
+        return self._brought(rules, write=False)
+
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Write it if anything differs.
+
+        Raises:
+            ProgrammingError: it could not be written; then nothing of ours is left.
+        """
+        return self._brought(rules, write=True)
+
+    def remove(self) -> TargetChanges:
+        """Delete what the ledger says is there, if it still is."""
+        known = self._ledger.find(self._record)
+        if known is None:
+            return TargetChanges(target=self.name)
+        there = self.clear()
+        self._ledger.put(self._record)
+        gone = [FlowChange(kind=ChangeKind.DELETE, key=each.key) for each in known.entries]
+        return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
+
+    def _brought(self, rules: Sequence[FlowRule], *, write: bool) -> TargetChanges:
+        placed, left_out = expressed(rules, lambda rule: self.lines(rule, self._settings))
+        try:
+            wanted = self.wanted(placed, self._settings, self._ledger.system)
+        except ValueError as error:
+            raise ProgrammingError(str(error)) from error
+        entries = tuple(
+            Entry(key=rule.key, what=describe_rule(rule), body="\n".join(lines))
+            for rule, lines in placed
+        )
+        if write and not entries:
+            return replace(self.remove(), left_out=left_out)
+        record = replace(self._record, entries=entries, beside=_digest(wanted.beside))
+        known, found = self._ledger.find(record), self.found()
+        anew = known is None or not found or known.beside != record.beside
+        detail = ""
+        if known is not None and not found:
+            detail = self.gone
+        elif known is not None and anew:
+            detail = "the classes change"
+        elif known is not None and known.found != _digest(found):
+            detail = "the table is not as it was written"
+        before = {each.key: each for each in known.entries} if known and found else {}
+        changes = [_change(each, before.pop(each.key, None), detail) for each in entries]
+        changes += [FlowChange(kind=ChangeKind.DELETE, key=key) for key in before]
+        done = TargetChanges(target=self.name, changes=tuple(changes), left_out=left_out)
+        if write and done.pending:
+            self._write_down(record, wanted, anew=anew)
+        return done
+
+    def _write_down(self, record: TargetRecord, wanted: Wanted, *, anew: bool) -> None:
+        """Write it, and in the ledger before and after."""
+        nothing_before = self._ledger.find(record) is None
+        # First without digests: what a crash in between leaves is made anew.
+        self._ledger.put(replace(record, beside=""))
+        try:
+            self.write(wanted, anew=anew)
+            self._ledger.put(replace(record, found=_digest(self.found())))
+        except ProgrammingError as error:
+            try:
+                if not nothing_before or self.found():
+                    self.clear()
+            except ProgrammingError as left:
+                message = f"{error.message}; what was made is left: {left}"
+                raise ProgrammingError(message, hint=error.hint) from error
+            self._ledger.put(self._record)
+            raise
+
+
+def _change(wanted: Entry, before: Entry | None, detail: str) -> FlowChange:
+    kind = ChangeKind.CREATE if before is None else ChangeKind.UPDATE
+    if before is not None and before.body == wanted.body and not detail:
+        kind = ChangeKind.KEEP
+    return FlowChange(kind=kind, key=wanted.key, what=wanted.what, detail=detail)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest() if text else ""
