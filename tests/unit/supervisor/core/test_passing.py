@@ -90,6 +90,26 @@ def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_m
     assert play.failures == [("/driver", late)]
 
 
+@pytest.mark.parametrize(
+    ("status", "kind", "said"),
+    [
+        (127, RunKind.COMMAND, "gone, as of a program that is not there: 'drive'"),
+        (126, RunKind.COMMAND, "gone, as of a program that may not be run: 'drive'"),
+        (1, RunKind.COMMAND, "gone"),
+        (127, RunKind.PYTHON, "gone"),
+    ],
+)
+def test_a_program_that_cannot_be_run_is_named(status: int, kind: RunKind, said: str) -> None:
+    plan = plan_of(planned_node("driver", kind=kind, managed=False))
+    process = replace(plan.processes[0], argv=("drive", "--fast"))
+    play = Play(replace(plan, processes=(process,)), ways={"driver start": "hang"})
+    play.die("driver", status)
+    play.wait(ALSO_S)
+    ((subject, text),) = play.failures
+    assert subject == "/driver"
+    assert text.endswith(f": {said}"), text
+
+
 def test_all_that_fails_side_by_side_is_named_and_no_other_step_begins() -> None:
     ways = dict.fromkeys(("a configure", "c configure", "d configure"), "hang")
     plan = plan_of(*(planned_node(key) for key in "abcd"))
