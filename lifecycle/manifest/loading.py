@@ -25,7 +25,6 @@ from lifecycle.manifest.building import (
     build_on_violation,
     positions_of,
     quantities,
-    section,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import (
@@ -39,18 +38,21 @@ from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
     Discovery,
     Link,
+    LinkKeys,
     Machine,
     Manifest,
     Network,
+    NetworkKeys,
     Node,
     Policy,
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import Shared, settle
+from lifecycle.manifest.written import build, read, read_part
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import Substituted, substitute
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, note
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
@@ -61,7 +63,7 @@ from lifecycle.network.nfe import canonical, parse_address
 _MAX_MAPPING_BYTES = 1_000_000
 
 
-def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Network:
+def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Network:
     """Build the network of a document; the defaults where it declares nothing.
 
     Args:
@@ -69,53 +71,50 @@ def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Netwo
         base: folder that the path of a mapping starts from.
         found: findings are appended here.
     """
-    cursor = root.get("network")
-    if cursor is None:
+    network = root.get("network")
+    if network is None:
         return Network()
-    return cursor.build(
+    keys = network.plain()
+    mapping = keys.pop("transport_priority_mapping", None)
+    return build(
         Network,
-        transport_priority_mapping=_priority_mapping(cursor, found),
-        five_qi_dscp=_dscp_mapping(cursor, base, found),
+        read(keys, NetworkKeys, strict=False),
+        transport_priority_mapping=None if mapping is None else _priority_mapping(network, found),
+        five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
     )
 
 
-def _priority_mapping(network: Cursor, found: list[Diagnostic]) -> TransportPriorityMapping | None:
-    cursor = network.get("transport_priority_mapping")
-    if cursor is None:
-        return None
+def _priority_mapping(
+    network: Document, found: list[Diagnostic]
+) -> TransportPriorityMapping | None:
+    place = ("transport_priority_mapping",)
     try:
-        return cursor.build(TransportPriorityMapping)
-    except ValueError as problem:
-        message, _, hint = str(problem).partition("; ")
-        found.append(error("manifest.transport-priority", cursor.at, message, hint))
+        return read_part(network, TransportPriorityMapping, place)
+    except msgspec.ValidationError as problem:
+        message, _, hint = str(problem.__cause__).partition("; ")
+        found.append(error("manifest.transport-priority", network.at(place), message, hint))
         return None
 
 
-def _dscp_mapping(network: Cursor, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
+def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
     """Read a mapping: a published one by its name, else a file."""
-    cursor = network.get("five_qi_dscp")
-    if cursor is None:
-        return None
-    name = cursor.value.text
+    name = network.text("five_qi_dscp")
     shipped = {each.name: each for each in dscp_mappings()}
     if name in shipped:
         return shipped[name]
     try:
         with (base / name).open("rb") as file:
             text = file.read(_MAX_MAPPING_BYTES)
-    except (OSError, ValueError) as problem:
-        why = getattr(problem, "strerror", None) or str(problem)
-        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {why}"
-        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
-        found.append(error("manifest.five-qi-dscp", cursor.at, message, hint))
-        return None
-    try:
         return parse_mapping(text)
+    except OSError as problem:
+        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {problem.strerror}"
+        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
     except ValueError as problem:
-        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {problem.__cause__}"
+        why = problem.__cause__ or problem
+        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {why}"
         hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
-        found.append(error("manifest.five-qi-dscp", cursor.at, message, hint))
-        return None
+    found.append(error("manifest.five-qi-dscp", network.at(("five_qi_dscp",)), message, hint))
+    return None
 
 
 THIS_HOST = "local"
@@ -127,7 +126,7 @@ _SECTIONS = ("discovery", "network", "data_layer", "on_violation")
 
 
 def build_manifest(
-    root: Cursor,
+    root: Document,
     *,
     path: str,
     arguments: tuple[tuple[str, str], ...],
@@ -149,8 +148,8 @@ def build_manifest(
     """
     machine = root.text("machine", machine)
     nodes = tuple(
-        build_node(key, cursor, base=base, machine=machine, environment=environment, found=found)
-        for key, cursor in root.entries("nodes")
+        build_node(key, each, base=base, machine=machine, environment=environment, found=found)
+        for key, each in root.entries("nodes")
     )
     return Manifest(
         path=path,
@@ -158,31 +157,30 @@ def build_manifest(
         system=root.text("system"),
         description=root.text("description"),
         machines=_machines(root, nodes, found),
-        discovery=section(root, "discovery", Discovery),
+        discovery=read_part(root, Discovery, ("discovery",)),
         network=build_network(root, base=base, found=found),
         data_layer=build_data_layer(root, found),
-        policy=section(root, "policy", Policy),
+        policy=read_part(root, Policy, ("policy",)),
         on_violation=build_on_violation(root),
         modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links")),
         positions={
             **positions_of(root, _SECTIONS),
-            **{key: each.key_at for key in _SECTIONS if (each := root.get(key)) is not None},
+            **{key: root.key_at((key,)) for key in _SECTIONS if key in root},
         },
     )
 
 
-def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[Machine, ...]:
+def _machines(root: Document, nodes: tuple[Node, ...], found: Findings) -> tuple[Machine, ...]:
     machines = []
-    for name, cursor in root.entries("machines"):
-        address = canonical(cursor.text("address"))
+    for name, each in root.entries("machines"):
+        address = canonical(each.text("address"))
         if address and parse_address(address) is None:
-            at = root.document.at((*cursor.place, "address"))
             message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
             hint = "look the name up: a plan must not depend on a name server"
-            found.append(error("manifest.address", at, message, hint))
-        machines.append(Machine(name=name, address=address, at=cursor.key_at))
+            found.append(error("manifest.address", each.at(("address",)), message, hint))
+        machines.append(Machine(name=name, address=address, at=each.key_at()))
     if THIS_HOST not in {each.name for each in machines}:
         here = next((node for node in nodes if node.machine == THIS_HOST), None)
         if here is not None:
@@ -190,14 +188,9 @@ def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[M
     return tuple(machines)
 
 
-def _link(cursor: Cursor) -> Link:
-    return cursor.build(
-        Link,
-        from_node=cursor.text("from"),
-        to_node=cursor.text("to"),
-        quantities=quantities(cursor),
-        at=cursor.at,
-    )
+def _link(part: Document) -> Link:
+    keys = read_part(part, LinkKeys)
+    return build(Link, keys, quantities=tuple(quantities(part, keys)), at=part.at())
 
 
 _NONE: Mapping[str, str] = MappingProxyType({})
@@ -298,12 +291,12 @@ def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
     return tuple(
         ArgumentDeclaration(
             name=name,
-            default=cursor.text("default") if "default" in cursor else None,
-            choices=tuple(each.value.text for each in cursor.items("choices")),
-            description=cursor.text("description"),
-            at=cursor.key_at,
+            default=each.text("default") if "default" in each else None,
+            choices=tuple(choice.root.text for choice in each.items("choices")),
+            description=each.text("description"),
+            at=each.key_at(),
         )
-        for name, cursor in Cursor.root(document).entries("arguments")
+        for name, each in document.entries("arguments")
     )
 
 
@@ -354,9 +347,9 @@ class _Reading(msgspec.Struct, frozen=True, kw_only=True):
     chain: tuple[include.Origin, ...]
     left_out: tuple[Place, ...]
 
-    def leaves_out(self, each: Cursor) -> bool:
+    def leaves_out(self, each: Document) -> bool:
         """Whether an entry of `include` or `groups` is left out."""
-        return (*each.document.place, *each.place) in self.left_out
+        return each.place in self.left_out
 
 
 NOTHING = Shared(machine=THIS_HOST)
@@ -384,7 +377,7 @@ class _Loading:
         given: Mapping[str, str],
         chain: tuple[include.Origin, ...],
         *,
-        entry: Cursor | None = None,
+        entry: Document | None = None,
         shared: Shared = NOTHING,
     ) -> Manifest | None:
         """Read one manifest and what it includes.
@@ -418,9 +411,8 @@ class _Loading:
         self.found += [each for _, each in validate(document, ignore=ignore)]
         if _has_errors(self.found[before:]):
             return None
-        root = Cursor.root(document)
         manifest = build_manifest(
-            root,
+            document,
             path=origin.shown,
             arguments=substituted.arguments,
             base=origin.path.parent,
@@ -428,20 +420,20 @@ class _Loading:
             found=self.found,
             machine=shared.machine,
         )
-        self._check_outermost(root, manifest)
+        self._check_outermost(document, manifest)
         reading = _Reading(
             origin=origin,
             chain=(*chain, origin),
             left_out=substituted.left_out,
         )
-        return self._contents(reading, root, manifest, shared=shared)
+        return self._contents(reading, document, manifest, shared=shared)
 
     def _substituted(
         self,
         document: Document,
         origin: include.Origin,
         given: Mapping[str, str],
-        entry: Cursor | None,
+        entry: Document | None,
     ) -> Substituted:
         surroundings = Surroundings(
             environment=self._environment,
@@ -457,7 +449,7 @@ class _Loading:
     def _contents(
         self,
         reading: _Reading,
-        root: Cursor,
+        root: Document,
         manifest: Manifest,
         *,
         shared: Shared,
@@ -468,9 +460,7 @@ class _Loading:
             manifest,
             nodes=tuple(shared.given_to(node) for node in manifest.nodes),
             left_out=tuple(
-                str(place[-1])
-                for place in reading.left_out
-                if place[:-1] == (*root.document.place, "nodes")
+                str(place[-1]) for place in reading.left_out if place[:-1] == (*root.place, "nodes")
             ),
         )
         for each in root.items("include"):
@@ -482,17 +472,17 @@ class _Loading:
                 manifest = self._include(manifest, each, reading.chain, shared)
         for each in root.items("groups"):
             if reading.leaves_out(each):
-                keys = tuple(_keys_of(each.value))
+                keys = tuple(_keys_of(each.root))
                 manifest = replace(manifest, left_out=(*manifest.left_out, *keys))
             else:
                 manifest = self._group(reading, manifest, each, shared)
         return manifest
 
-    def _group(self, reading: _Reading, outer: Manifest, entry: Cursor, shared: Shared) -> Manifest:
-        place = (*entry.document.place, *entry.place)
-        root = Cursor.root(Document(file=entry.document.file, root=entry.value, place=place))
+    def _group(
+        self, reading: _Reading, outer: Manifest, entry: Document, shared: Shared
+    ) -> Manifest:
         inner = build_manifest(
-            root,
+            entry,
             path=outer.path,
             arguments=(),
             base=reading.origin.path.parent,
@@ -500,18 +490,18 @@ class _Loading:
             found=self.found,
             machine=shared.machine,
         )
-        inner = self._contents(reading, root, inner, shared=shared)
+        inner = self._contents(reading, entry, inner, shared=shared)
         return self._joined(outer, inner, entry, "group")
 
-    def _joined(self, outer: Manifest, inner: Manifest, entry: Cursor, what: str) -> Manifest:
+    def _joined(self, outer: Manifest, inner: Manifest, entry: Document, what: str) -> Manifest:
         prefix, namespace = entry.text("prefix"), entry.text("namespace")
         inner = include.move(inner, prefix=prefix, namespace=namespace)
-        return include.join(outer, inner, entry.at, self.found, what=what)
+        return include.join(outer, inner, entry.at(), self.found, what=what)
 
     def _include(
         self,
         outer: Manifest,
-        entry: Cursor,
+        entry: Document,
         chain: tuple[include.Origin, ...],
         shared: Shared,
     ) -> Manifest:
@@ -522,9 +512,9 @@ class _Loading:
         if self._documents > include.MAX_DOCUMENTS:
             if self._documents == include.MAX_DOCUMENTS + 1:
                 message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
-                self.found.append(error("manifest.include", entry.at, message))
+                self.found.append(error("manifest.include", entry.at(), message))
             return outer
-        given = {name: each.value.text for name, each in entry.entries("arguments")}
+        given = {name: each.root.text for name, each in entry.entries("arguments")}
         inner = self.read(origin, given, chain, entry=entry, shared=shared)
         return outer if inner is None else self._joined(outer, inner, entry, "include")
 
@@ -537,7 +527,7 @@ class _Loading:
             hint = f"rename it to {stem}{SUFFIX}"
             self.found.append(note("manifest.suffix", at, message, hint))
 
-    def _check_outermost(self, root: Cursor, manifest: Manifest) -> None:
+    def _check_outermost(self, root: Document, manifest: Manifest) -> None:
         """Warn where a system-wide section of an included manifest has no effect."""
         if self._outermost is None:
             self._outermost = manifest
@@ -546,16 +536,15 @@ class _Loading:
         for key in (*_SECTIONS, "policy", "modes"):
             if key in root and getattr(manifest, key) != getattr(outer, key):
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
-                at = root.document.key_at((key,))
+                at = root.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))
 
 
 def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
     """Return what is wrong with something that is left out, whatever its substitutions become."""
-    value = document.find(place)
-    if value is None:
+    part = document.get(*place)
+    if part is None:
         return []
-    part = Document(file=document.file, root=value, place=place)
     kind = str(place[-2]).removesuffix("s").capitalize()
     return [each for _, each in validate(part, definition=kind, is_resolved=False)]
 

@@ -24,7 +24,7 @@ from lifecycle.manifest.interface import build_inline
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
 from lifecycle.manifest.qos import POLICIES
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import quote
 
@@ -75,7 +75,7 @@ class _Reader:
         inline = replace(document, root=replace(root, data=entries))
         found = [each for _, each in validate(inline, definition="Interface")]
         if not found:
-            self.interface = build_inline(Cursor.root(inline), found)
+            self.interface = build_inline(inline, found)
         rules = {"manifest.duplicate-name": "nodl.duplicate"}
         self.found += [replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found]
         if any(each.severity is Severity.ERROR for each in self.found):

@@ -286,7 +286,7 @@ def validate(
     type_ = getattr(written, definition or "Manifest")
     if is_resolved and not ignore and _fits(document, type_):
         return ()
-    plain = document.root.plain()
+    plain = document.plain()
     errors = validator(definition, is_resolved).iter_errors(plain)
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}

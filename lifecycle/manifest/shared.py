@@ -27,7 +27,8 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
-from lifecycle.manifest.yaml.document import Cursor, error, warning
+from lifecycle.manifest.written import read
+from lifecycle.manifest.yaml.document import Document, error, warning
 
 SIM_TIME = "use_sim_time"
 
@@ -47,31 +48,28 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
     remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
     supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
 
-    def inner(self, cursor: Cursor, found: Findings) -> Shared:
+    def inner(self, root: Document, found: Findings) -> Shared:
         """Return what holds inside a document or group.
 
         Args:
-            cursor: its root.
+            root: its keys.
             found: findings are appended here.
         """
-        parameters = build_parameters(cursor, found)
-        sim_time = cursor.get(SIM_TIME)
+        parameters = build_parameters(root, found)
+        sim_time = root.get(SIM_TIME)
         if sim_time is not None and SIM_TIME in parameters:
             message = f"cannot set {SIM_TIME} twice"
             found.append(
-                error("manifest.duplicate-parameter", sim_time.key_at, message, "remove one")
+                error("manifest.duplicate-parameter", sim_time.key_at(), message, "remove one")
             )
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
-            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at)
-        remap = {name: (each.value.text, each.key_at) for name, each in cursor.entries("remap")}
-        written = cursor.build(Supervision)
-        supervision = {
-            key: (getattr(written, key), each.at)
-            for key in SUPERVISION_KEYS
-            if (each := cursor.get(key)) is not None
-        }
+            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at())
+        remap = {name: (each.root.text, each.key_at()) for name, each in root.entries("remap")}
+        keys = {key: value for key, value in root.plain().items() if key in SUPERVISION_KEYS}
+        written = read(keys, Supervision, strict=False)
+        supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
         return Shared(
-            machine=cursor.text("machine", self.machine),
+            machine=root.text("machine", self.machine),
             parameters={**self.parameters, **parameters},
             remap={**self.remap, **remap},
             supervision={**self.supervision, **supervision},

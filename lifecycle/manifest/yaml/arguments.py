@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error, warning
+from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, warning
 from lifecycle.manifest.yaml.substitutions import (
     NOWHERE,
     NotRunError,
@@ -62,7 +62,7 @@ def substitute(
     given: Mapping[str, str],
     surroundings: Surroundings = NOWHERE,
     *,
-    include: Cursor | None = None,
+    include: Document | None = None,
 ) -> Substituted:
     """Resolve a document's arguments, then every substitution in its values.
 
@@ -88,7 +88,7 @@ class _Substitution:
     """One run over one document."""
 
     def __init__(
-        self, document: Document, surroundings: Surroundings, include: Cursor | None
+        self, document: Document, surroundings: Surroundings, include: Document | None
     ) -> None:
         self.values: dict[str, str] = {}
         self.found: list[Diagnostic] = []
@@ -115,8 +115,7 @@ class _Substitution:
                 message = f"cannot set the argument {quote(name)}; {known}"
                 at = self._document.key_at(("arguments",))
                 if self._include:
-                    owner = self._include
-                    at = owner.document.key_at((*owner.place, "arguments", name))
+                    at = self._include.key_at(("arguments", name))
                 hint = did_you_mean(name, declared)
                 self.found.append(error("manifest.unknown-argument", at, message, hint))
         for name in declared:
@@ -144,8 +143,7 @@ class _Substitution:
             message = f"cannot do without a value for the argument {name!r}{what}"
             hint = f"give {name}:=VALUE on the command line, or a default here"
             if self._include:
-                at = self._include.at
-                hint = f"add it to the arguments of the include at {at.spelled}"
+                hint = f"add it to the arguments of the include at {self._include.at().spelled}"
             where = self._document.key_at(place)
             self.found.append(error("manifest.missing-argument", where, message, hint))
             return None

@@ -18,7 +18,7 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node, Run
 from lifecycle.manifest.names import topic_of
-from lifecycle.manifest.yaml.document import Cursor, error
+from lifecycle.manifest.yaml.document import Document, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 MAX_DEPTH = 16
@@ -54,7 +54,7 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
         return cls(path=path, identity=identity)
 
 
-def locate(entry: Cursor, chain: tuple[Origin, ...], found: Findings) -> Origin | None:
+def locate(entry: Document, chain: tuple[Origin, ...], found: Findings) -> Origin | None:
     """Return the file that an entry of `include:` names; None after reporting why there is none.
 
     Args:
@@ -63,7 +63,7 @@ def locate(entry: Cursor, chain: tuple[Origin, ...], found: Findings) -> Origin 
         found: findings are appended here.
     """
     name = entry.text("manifest")
-    at = entry.document.at((*entry.place, "manifest"))
+    at = entry.at(("manifest",))
     path = Path(os.path.normpath(chain[-1].path.parent / name))
     origin = Origin.of(path)
     identities = [each.identity for each in chain]
