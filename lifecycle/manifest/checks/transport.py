@@ -420,15 +420,14 @@ def _pair(
 
 
 def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    size = each.max_message_size
+    size = each.need.max_message_size
     if each.max_datagram_bytes is None or size is None:
         return
     limit = system.manifest.network.max_datagram_bytes or max_unfragmented(
         ipv6=":" in system.manifest.address_of(node.machine)
     )
-    declared = "declared" if each.need.max_message_size is not None else "the bound of its type"
     message = (
-        f"cannot send a message of {each.need.name!r}, up to {size} bytes ({declared}), in one "
+        f"cannot send a message of {each.need.name!r}, up to {size} bytes (declared), in one "
         f"datagram: with {RTPS_OVERHEAD_BYTES} bytes of RTPS it is {datagram_bytes(size)} of UDP "
         f"payload and {limit} fit; of IP's fragments only the first has ports, so a network would "
         f"not know the others as this flow"
