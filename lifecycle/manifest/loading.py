@@ -285,7 +285,7 @@ def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
         ManifestError: it cannot be read, or its `arguments:` are none.
     """
     document = read_document(path, shown=os.fspath(path))
-    wrong = [each for place, each in validate(document) if place[:1] == ("arguments",)]
+    wrong = [each for each in validate(document) if each.at.path.startswith("arguments")]
     if wrong:
         raise ManifestError(in_order(wrong, [document.file]))
     return tuple(
@@ -408,7 +408,7 @@ class _Loading:
             if (around := document.find(place[:-1])) is not None and not around.data
         ]
         ignore = [*substituted.broken, *substituted.left_out, *emptied]
-        self.found += [each for _, each in validate(document, ignore=ignore)]
+        self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return None
         manifest = build_manifest(
@@ -540,13 +540,13 @@ class _Loading:
                 self.found.append(note("manifest.include-ignored", at, message))
 
 
-def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
+def _misspelt(document: Document, place: Place) -> tuple[Diagnostic, ...]:
     """Return what is wrong with something that is left out, whatever its substitutions become."""
     part = document.get(*place)
     if part is None:
-        return []
+        return ()
     kind = str(place[-2]).removesuffix("s").capitalize()
-    return [each for _, each in validate(part, definition=kind, is_resolved=False)]
+    return validate(part, definition=kind, is_resolved=False)
 
 
 def _keys_of(group: Value) -> Iterator[str]:

@@ -73,7 +73,7 @@ class _Reader:
             known = {name: value for name, value in parameters.items() if value is not None}
             entries["parameters"] = replace(each, data=known)
         inline = replace(document, root=replace(root, data=entries))
-        found = [each for _, each in validate(inline, definition="Interface")]
+        found = list(validate(inline, definition="Interface"))
         if not found:
             self.interface = build_inline(inline, found)
         rules = {"manifest.duplicate-name": "nodl.duplicate"}
