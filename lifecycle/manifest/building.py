@@ -1,8 +1,8 @@
-"""Validated `nodes:`, `discovery:`, `data_layer:` and `connections:` → frozen types.
+"""Validated `nodes:`, `network:`, `data_layer:`, `modes:` and `connections:` → frozen types.
 
 Owns: how a node's keys become fields, its parameters flat and its paths absolute; reading
 connection URLs out of a document; and the findings about all of them that a schema cannot detect.
-Pure but for reading interfaces by reference.
+Pure but for reading interfaces and mappings by reference.
 """
 
 from __future__ import annotations
@@ -13,9 +13,17 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+import msgspec
+
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
+from lifecycle.manifest.interface import (
+    Findings,
+    build_inline,
+    build_parameters,
+    flat_parameters,
+    parameter_value,
+)
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     PROCESS_KEYS,
@@ -34,6 +42,8 @@ from lifecycle.manifest.model import (
     MeasuredKeys,
     Mode,
     ModeParameter,
+    Network,
+    NetworkKeys,
     Node,
     OnViolation,
     ParameterValue,
@@ -49,12 +59,72 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.manifest.nodl import read_interface
-from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, error, note
-from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
+from lifecycle.manifest.shared import Shared
+from lifecycle.manifest.written import build, read, read_part
+from lifecycle.manifest.yaml.document import Document, error
+from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.network.dscp import TransportPriorityMapping
+from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
+
+
+_MAX_MAPPING_BYTES = 1_000_000
+
+
+def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Network:
+    """Build the network of a document; the defaults where it declares nothing.
+
+    Args:
+        root: the document.
+        base: folder that the path of a mapping starts from.
+        found: findings are appended here.
+    """
+    network = root.get("network")
+    if network is None:
+        return Network()
+    keys = network.plain()
+    mapping = keys.pop("transport_priority_mapping", None)
+    return build(
+        Network,
+        read(keys, NetworkKeys, strict=False),
+        transport_priority_mapping=None if mapping is None else _priority_mapping(network, found),
+        five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
+    )
+
+
+def _priority_mapping(
+    network: Document, found: list[Diagnostic]
+) -> TransportPriorityMapping | None:
+    place = ("transport_priority_mapping",)
+    try:
+        return read_part(network, TransportPriorityMapping, place)
+    except msgspec.ValidationError as problem:
+        message, _, hint = str(problem.__cause__).partition("; ")
+        found.append(error("manifest.transport-priority", network.at(place), message, hint))
+        return None
+
+
+def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
+    """Read a mapping: a published one by its name, else a file."""
+    name = network.text("five_qi_dscp")
+    shipped = {each.name: each for each in dscp_mappings()}
+    if name in shipped:
+        return shipped[name]
+    try:
+        with (base / name).open("rb") as file:
+            text = file.read(_MAX_MAPPING_BYTES)
+        return parse_mapping(text)
+    except OSError as problem:
+        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {problem.strerror}"
+        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
+    except ValueError as problem:
+        why = problem.__cause__ or problem
+        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {why}"
+        hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
+    found.append(error("manifest.five-qi-dscp", network.at(("five_qi_dscp",)), message, hint))
+    return None
 
 
 def build_data_layer(root: Document, found: list[Diagnostic]) -> DataLayer:
@@ -191,7 +261,7 @@ def build_node(
     part: Document,
     *,
     base: Path,
-    machine: str,
+    shared: Shared,
     environment: Mapping[str, str],
     found: Findings,
 ) -> Node:
@@ -201,25 +271,26 @@ def build_node(
         key: its key in the document.
         part: its value.
         base: folder that relative paths start from.
-        machine: the machine of a node that names none.
+        shared: what it gets from the document and groups around it.
         environment: for AMENT_PREFIX_PATH.
         found: findings are appended here.
     """
     node = read_part(part, written.Node)
     parameters = build_parameters(part, found)
     interface = build_interface(part, base=base, environment=environment, found=found)
-    return build(
+    built = build(
         Node,
         node,
-        key=key,
+        key=shared.key(key),
         name=node.name or key,
-        namespace=f"/{node.namespace.strip('/')}",
-        machine=node.machine or machine,
-        run=_run(part, base, found),
+        namespace=f"/{shared.within(node.namespace)}",
+        machine=node.machine or shared.machine,
+        process=shared.key(node.process) if node.process else "",
+        run=_run(part, base, shared, found),
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
         remap=tuple(node.remap.items()),
-        after=tuple(_after(part, found)),
+        after=tuple(_after(part, shared, found)),
         supervision=build(Supervision, node),
         on_violation=build_on_violation(part),
         health=None if node.health is None else _health(node.health),
@@ -230,24 +301,26 @@ def build_node(
         written_paths=tuple(_written_paths(node)),
         at=part.key_at(),
     )
+    return shared.given_to(built)
 
 
-def _after(node: Document, found: Findings) -> Iterator[After]:
-    for key, each in node.entries("after"):
+def _after(node: Document, shared: Shared, found: Findings) -> Iterator[After]:
+    for name, each in node.entries("after"):
+        key = shared.key(name)
         if not isinstance(each.root.data, dict):
             yield After(node=key, condition=Condition(each.scalar), at=each.key_at())
             continue
         for word, shown in each.entries():
             by, names = ReadyBy(word), list[tuple[str, ParameterValue | None, Position]]()
             if isinstance(shown.root.data, dict):
-                values = _flat(shown.entries(), found)
+                values = flat_parameters(shown.entries(), found)
                 names += [(name, value, at) for name, (value, at) in values.items()]
             else:
                 so = True if by is ReadyBy.PARAMETER else None
                 items = shown.items() if isinstance(shown.root.data, tuple) else (shown,)
                 names += [(each.root.text, so, each.at()) for each in items]
-            for name, value, at in names:
-                yield After(node=key, condition=Readiness(by=by, name=name, value=value), at=at)
+            for named, value, at in names:
+                yield After(node=key, condition=Readiness(by=by, name=named, value=value), at=at)
 
 
 def absolute(base: Path, path: str) -> str:
@@ -259,7 +332,7 @@ def absolute(base: Path, path: str) -> str:
 _OF_PYTHON = ("arguments", "executor", "threads")
 
 
-def _run(node: Document, base: Path, found: Findings) -> Run:
+def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     part = node.get("run")
     if part is None:
         return Run(kind=RunKind.ATTACH)
@@ -294,7 +367,13 @@ def _run(node: Document, base: Path, found: Findings) -> Run:
         working_directory=absolute(base, run.working_directory) if run.working_directory else "",
         prefix=_words(part, "prefix", found),
         resources=_resources(part, run, found),
+        container=_container(run.container or "", shared),
     )
+
+
+def _container(name: str, shared: Shared) -> str:
+    """Return the container of a component: a full name, or the key of a node of the system."""
+    return name if not name or name.startswith("/") else shared.key(name)
 
 
 def _resources(part: Document, run: written.Run, found: Findings) -> Resources | None:
@@ -309,7 +388,7 @@ def _resources(part: Document, run: written.Run, found: Findings) -> Resources |
 
 
 def _values(run: Document, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
-    values = ((name, _parameter(name, each, found)) for name, each in run.entries(key))
+    values = ((name, parameter_value(name, each, found)) for name, each in run.entries(key))
     return tuple((name, value) for name, value in values if value is not None)
 
 
@@ -353,55 +432,12 @@ def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
             parameters=tuple(
                 ModeParameter(node=key, name=parameter, value=value, at=at)
                 for key, node in mode.entries("parameters")
-                for parameter, (value, at) in _flat(node.entries(), found).items()
+                for parameter, (value, at) in flat_parameters(node.entries(), found).items()
             ),
             at=mode.key_at(),
         )
         for name, mode in root.entries("modes")
     )
-
-
-def build_parameters(node: Document, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
-    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
-    return _flat(node.entries("parameters"), found)
-
-
-def _flat(
-    entries: Iterable[tuple[str, Document]], found: Findings
-) -> dict[str, tuple[ParameterValue, Position]]:
-    flat: dict[str, tuple[ParameterValue, Position]] = {}
-    pending = list(reversed(list(entries)))
-    while pending:
-        name, part = pending.pop()
-        if isinstance(part.root.data, dict):
-            inner = [(f"{name}.{key}", each) for key, each in part.entries()]
-            pending.extend(reversed(inner))
-            continue
-        if name in flat:
-            message = f"cannot set the parameter {name!r} twice"
-            first = flat[name][1]
-            hint = f"the first value stands at {first.spelled}"
-            found.append(error("manifest.duplicate-parameter", part.at(), message, hint))
-            continue
-        value = _parameter(name, part, found)
-        if value is not None:
-            flat[name] = (value, part.key_at())
-    return flat
-
-
-def _parameter(name: str, part: Document, found: Findings) -> ParameterValue | None:
-    if isinstance(part.root.data, tuple):
-        return scalar_tuple(part, found)
-    text = part.root.text
-    if not part.root.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
-        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
-        hint = f'write {name}: true or false, or {name}: "{text}"'
-        found.append(note("manifest.yaml-1.1-boolean", part.at(), message, hint))
-    if not part.root.quoted and has_leading_zero(text):
-        message = f"cannot tell which number {text} is meant as; it is read as a string"
-        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
-        found.append(note("manifest.leading-zero", part.at(), message, hint))
-    return part.scalar
 
 
 def _health(health: written.Health) -> Health:

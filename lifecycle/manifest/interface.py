@@ -1,17 +1,17 @@
 """Validated interfaces → endpoints and parameter declarations, of manifests and NoDL documents.
 
 Owns: `build_inline`: what a QoS profile is with presets and defaults, declared defaults of
-parameters in their types; `scalar_tuple`, a ROS array of a document. Pure.
+parameters in their types; values that are given to parameters, flat. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
 from lifecycle.manifest import written
-from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
@@ -28,8 +28,8 @@ from lifecycle.manifest.qos import (
     problems,
 )
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, Scalar, error
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import Document, Scalar, error, note
+from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
 
 Findings = list[Diagnostic]
 """Findings in the order of detection; every builder appends and continues."""
@@ -148,7 +148,52 @@ def _default(part: Document, type_: str, found: Findings) -> ParameterValue | No
     return None
 
 
-def scalar_tuple(part: Document, found: Findings) -> tuple[bool | int | float | str, ...] | None:
+def build_parameters(node: Document, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
+    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
+    return flat_parameters(node.entries("parameters"), found)
+
+
+def flat_parameters(
+    entries: Iterable[tuple[str, Document]], found: Findings
+) -> dict[str, tuple[ParameterValue, Position]]:
+    """Return values by dotted name, and where each is written."""
+    flat: dict[str, tuple[ParameterValue, Position]] = {}
+    pending = list(reversed(list(entries)))
+    while pending:
+        name, part = pending.pop()
+        if isinstance(part.root.data, dict):
+            inner = [(f"{name}.{key}", each) for key, each in part.entries()]
+            pending.extend(reversed(inner))
+            continue
+        if name in flat:
+            message = f"cannot set the parameter {name!r} twice"
+            first = flat[name][1]
+            hint = f"the first value stands at {first.spelled}"
+            found.append(error("manifest.duplicate-parameter", part.at(), message, hint))
+            continue
+        value = parameter_value(name, part, found)
+        if value is not None:
+            flat[name] = (value, part.key_at())
+    return flat
+
+
+def parameter_value(name: str, part: Document, found: Findings) -> ParameterValue | None:
+    """Return the value of a parameter or argument; None after reporting that it cannot be one."""
+    if isinstance(part.root.data, tuple):
+        return _scalar_tuple(part, found)
+    text = part.root.text
+    if not part.root.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
+        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
+        hint = f'write {name}: true or false, or {name}: "{text}"'
+        found.append(note("manifest.yaml-1.1-boolean", part.at(), message, hint))
+    if not part.root.quoted and has_leading_zero(text):
+        message = f"cannot tell which number {text} is meant as; it is read as a string"
+        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
+        found.append(note("manifest.leading-zero", part.at(), message, hint))
+    return part.scalar
+
+
+def _scalar_tuple(part: Document, found: Findings) -> tuple[bool | int | float | str, ...] | None:
     """Return a ROS array; None after reporting that its items differ in type."""
     values = _scalars(part)
     types = {type(each).__name__: each for each in values}

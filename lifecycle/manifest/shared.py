@@ -14,10 +14,9 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.manifest.building import build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import Findings
+from lifecycle.manifest.interface import Findings, build_parameters
 from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
     Manifest,
@@ -33,23 +32,31 @@ from lifecycle.manifest.yaml.document import Document, error, warning
 SIM_TIME = "use_sim_time"
 
 
+THIS_HOST = "local"
+"""Name of the machine of nodes that name none; declared implicitly, without address."""
+
+
 class Shared(msgspec.Struct, frozen=True, kw_only=True):
-    """What all nodes of a document or group get that have nothing nearer.
+    """What all nodes of a document or group get from it and from what is around it.
 
     Attributes:
+        prefix: of their keys, `left/arm`; empty for none.
+        namespace: before their own, `left/arm`; empty for none.
         parameters: value and place, by name.
         remap: new name and place, by the name in the node's code.
         machine: where a node runs that names no machine.
         supervision: value and place, by key of `Supervision`.
     """
 
-    machine: str
+    prefix: str = ""
+    namespace: str = ""
+    machine: str = THIS_HOST
     parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
     remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
     supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
 
     def inner(self, root: Document, found: Findings) -> Shared:
-        """Return what holds inside a document or group.
+        """Return what holds inside a document or group, or in what an include names.
 
         Args:
             root: its keys.
@@ -69,11 +76,21 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
         written = read(keys, Supervision, strict=False)
         supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
         return Shared(
+            prefix=self.key(root.text("prefix")) if "prefix" in root else self.prefix,
+            namespace=self.within(root.text("namespace")),
             machine=root.text("machine", self.machine),
             parameters={**self.parameters, **parameters},
             remap={**self.remap, **remap},
             supervision={**self.supervision, **supervision},
         )
+
+    def key(self, key: str) -> str:
+        """Return what a key of a node here is called in the system."""
+        return f"{self.prefix}/{key}" if self.prefix else key
+
+    def within(self, namespace: str) -> str:
+        """Return a namespace below the one here, without slashes at its ends."""
+        return "/".join(each for each in (self.namespace, namespace.strip("/")) if each)
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself."""
