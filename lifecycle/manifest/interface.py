@@ -6,7 +6,8 @@ parameters in their types; values that are given to parameters, flat. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import msgspec
 
@@ -28,7 +29,7 @@ from lifecycle.manifest.qos import (
     problems,
 )
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, Scalar, error, note
+from lifecycle.manifest.yaml.document import Document, error, note
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
 
 Findings = list[Diagnostic]
@@ -121,31 +122,29 @@ def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclara
     )
 
 
-def _is_int(value: Scalar) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-_FITS: Mapping[str, Callable[[Scalar], bool]] = {
-    "bool": lambda value: isinstance(value, bool),
-    "int": _is_int,
-    "double": lambda value: isinstance(value, float) or _is_int(value),
-    "string": lambda value: isinstance(value, str),
-    "byte": lambda value: _is_int(value) and isinstance(value, int) and 0 <= value <= 0xFF,
+_TYPES: Mapping[str, Any] = {
+    "bool": bool,
+    "int": int,
+    "double": float,
+    "string": str,
+    "bool_array": tuple[bool, ...],
+    "int_array": tuple[int, ...],
+    "double_array": tuple[float, ...],
+    "string_array": tuple[str, ...],
+    "byte_array": tuple[written.Octet, ...],
 }
 
 
 def _default(part: Document, type_: str, found: Findings) -> ParameterValue | None:
     """Return a declared default in its declared type; None after reporting that it does not fit."""
-    one, is_array = type_.removesuffix("_array"), type_.endswith("_array")
-    if isinstance(part.root.data, tuple) == is_array:
-        values = _scalars(part) if is_array else [part.scalar]
-        if all(_FITS[one](each) for each in values):
-            known = [_known(each) for each in values]
-            typed = [float(each) for each in known] if one == "double" else known
-            return tuple(typed) if is_array else typed[0]
-    message = f"cannot use {quote(part.plain())} as default of a parameter of type {type_}"
-    found.append(error("manifest.parameter-default", part.at(), message))
-    return None
+    try:
+        value: ParameterValue = msgspec.convert(part.plain(), _TYPES[type_])
+    except msgspec.ValidationError:
+        shown = quote(part.plain())
+        message = f"cannot use {shown} as default of a parameter of type {type_}"
+        found.append(error("manifest.parameter-default", part.at(), message))
+        return None
+    return value
 
 
 def build_parameters(node: Document, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
@@ -195,24 +194,13 @@ def parameter_value(name: str, part: Document, found: Findings) -> ParameterValu
 
 def _scalar_tuple(part: Document, found: Findings) -> tuple[bool | int | float | str, ...] | None:
     """Return a ROS array; None after reporting that its items differ in type."""
-    values = _scalars(part)
+    values = part.plain()
     types = {type(each).__name__: each for each in values}
-    if len(types) > 1:
-        names = {"str": "string", "float": "double"}
-        spelled = " and ".join(
-            f"{names.get(name, name)} {quote(each)}" for name, each in types.items()
-        )
-        message = f"cannot mix {spelled} in one array; a ROS array holds one type"
-        hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
-        found.append(error("manifest.parameter-array", part.at(), message, hint))
-        return None
-    return tuple(_known(each) for each in values)
-
-
-def _scalars(part: Document) -> list[Scalar]:
-    return [each.scalar for each in part.items()]
-
-
-def _known(value: Scalar) -> bool | int | float | str:
-    assert value is not None  # the schema has no null in arrays
-    return value
+    if len(types) == 1 or not values:
+        return tuple(values)
+    names = {"str": "string", "float": "double"}
+    spelled = " and ".join(f"{names.get(name, name)} {quote(each)}" for name, each in types.items())
+    message = f"cannot mix {spelled} in one array; a ROS array holds one type"
+    hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
+    found.append(error("manifest.parameter-array", part.at(), message, hint))
+    return None
