@@ -1,8 +1,8 @@
-"""Validated `nodes:`, `discovery:`, `data_layer:` and `connections:` → frozen types.
+"""Validated `nodes:`, `network:`, `data_layer:`, `modes:` and `connections:` → frozen types.
 
 Owns: how a node's keys become fields, its parameters flat and its paths absolute; reading
 connection URLs out of a document; and the findings about all of them that a schema cannot detect.
-Pure but for reading interfaces by reference.
+Pure but for reading interfaces and mappings by reference.
 """
 
 from __future__ import annotations
@@ -12,11 +12,18 @@ import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+
+import msgspec
 
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
+from lifecycle.manifest.interface import (
+    Findings,
+    build_inline,
+    build_parameters,
+    flat_parameters,
+    parameter_value,
+)
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     PROCESS_KEYS,
@@ -32,9 +39,11 @@ from lifecycle.manifest.model import (
     FlowNeed,
     Health,
     Interface,
-    Limits,
+    MeasuredKeys,
     Mode,
     ModeParameter,
+    Network,
+    NetworkKeys,
     Node,
     OnViolation,
     ParameterValue,
@@ -48,62 +57,110 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
     Supervision,
-    Timeouts,
 )
 from lifecycle.manifest.nodl import read_interface
-from lifecycle.manifest.yaml.document import Cursor, error, note
-from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
+from lifecycle.manifest.shared import Shared
+from lifecycle.manifest.written import build, read, read_part
+from lifecycle.manifest.yaml.document import Document, error
+from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.network.dscp import TransportPriorityMapping
+from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
 
 
-T = TypeVar("T")
+_MAX_MAPPING_BYTES = 1_000_000
 
 
-def section(cursor: Cursor, key: str, type_: type[T]) -> T:
-    """Return a section that is kept as it is written; the defaults of its keys if it is missing."""
-    return written.read(cursor.document.plain((*cursor.place, key)), type_, strict=False)
+def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Network:
+    """Build the network of a document; the defaults where it declares nothing.
+
+    Args:
+        root: the document.
+        base: folder that the path of a mapping starts from.
+        found: findings are appended here.
+    """
+    network = root.get("network")
+    if network is None:
+        return Network()
+    keys = network.plain()
+    mapping = keys.pop("transport_priority_mapping", None)
+    return build(
+        Network,
+        read(keys, NetworkKeys, strict=False),
+        transport_priority_mapping=None if mapping is None else _priority_mapping(network, found),
+        five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
+    )
 
 
-def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
+def _priority_mapping(
+    network: Document, found: list[Diagnostic]
+) -> TransportPriorityMapping | None:
+    place = ("transport_priority_mapping",)
+    try:
+        return read_part(network, TransportPriorityMapping, place)
+    except msgspec.ValidationError as problem:
+        message, _, hint = str(problem.__cause__).partition("; ")
+        found.append(error("manifest.transport-priority", network.at(place), message, hint))
+        return None
+
+
+def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
+    """Read a mapping: a published one by its name, else a file."""
+    name = network.text("five_qi_dscp")
+    shipped = {each.name: each for each in dscp_mappings()}
+    if name in shipped:
+        return shipped[name]
+    try:
+        with (base / name).open("rb") as file:
+            text = file.read(_MAX_MAPPING_BYTES)
+        return parse_mapping(text)
+    except OSError as problem:
+        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {problem.strerror}"
+        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
+    except ValueError as problem:
+        why = problem.__cause__ or problem
+        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {why}"
+        hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
+    found.append(error("manifest.five-qi-dscp", network.at(("five_qi_dscp",)), message, hint))
+    return None
+
+
+def build_data_layer(root: Document, found: list[Diagnostic]) -> DataLayer:
     """Build the data layer of a document; the defaults where it declares nothing."""
-    layer = section(root, "data_layer", DataLayer)
+    layer = read_part(root, DataLayer, ("data_layer",))
     group = layer.multicast_group
     if not _is_ipv4_group(group):
-        at = root.document.at((*root.place, "data_layer", "multicast_group"))
+        at = root.at(("data_layer", "multicast_group"))
         message = f"cannot use {quote(group)} as a multicast group; it must be IPv4"
         hint = "239.255.0.0 to 239.255.255.255 stay within an organisation (RFC 2365)"
         found.append(error("manifest.multicast-group", at, message, hint))
     return layer
 
 
-def build_on_violation(cursor: Cursor) -> OnViolation:
-    """Build `on_violation` of a document or a node."""
-    return tuple(
-        Reaction(rule=name, what=Consequence.MODE, mode=each.text("mode"))
-        if isinstance(each.value.data, Mapping)
-        else Reaction(rule=name, what=Consequence(each.scalar))
-        for name, each in _consequences(cursor)
-    )
-
-
-def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
-    """Yield the entries of `on_violation`; a single value is for every rule."""
-    reactions = cursor.get("on_violation")
+def build_on_violation(section: Document) -> OnViolation:
+    """Build `on_violation` of a document or a node; a single value is for every rule."""
+    reactions = section.get("on_violation")
     if reactions is None:
-        return
-    if isinstance(reactions.value.data, Mapping) and [*reactions.value.data] != ["mode"]:
-        yield from reactions.entries()
-    else:
-        yield BY_DEFAULT, reactions
+        return ()
+    data = reactions.root.data
+    if isinstance(data, dict) and [*data] != ["mode"]:
+        return tuple(_reaction(rule, each) for rule, each in reactions.entries())
+    return (_reaction(BY_DEFAULT, reactions),)
+
+
+def _reaction(rule: str, what: Document) -> Reaction:
+    if isinstance(what.root.data, dict):
+        return Reaction(rule=rule, what=Consequence.MODE, mode=what.text("mode"))
+    return Reaction(rule=rule, what=Consequence(what.scalar))
 
 
 _NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
 """Sections of which an entry is where its key is; of all others, a value is where it begins."""
 
 
-def positions_of(section: Cursor, keys: Iterable[str]) -> dict[str, Position]:
+def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
     """Return where parts of a document are, by path below a section: `run.python`, `remap.scan`.
 
     Args:
@@ -111,15 +168,15 @@ def positions_of(section: Cursor, keys: Iterable[str]) -> dict[str, Position]:
         keys: those keys of it whose values are looked at, with all that is inside.
     """
     found = {}
-    if (reactions := section.get("on_violation")) is not None:
-        found[f"on_violation.{BY_DEFAULT}"] = reactions.key_at
-    pending: list[tuple[tuple[str, ...], Cursor]] = [
+    if "on_violation" in section:
+        found[f"on_violation.{BY_DEFAULT}"] = section.key_at(("on_violation",))
+    pending: list[tuple[tuple[str, ...], Document]] = [
         ((key,), each) for key in keys if (each := section.get(key)) is not None
     ]
     while pending:
         steps, each = pending.pop()
         is_named = steps[0] in _NAMED_BY_USERS and (len(steps) == 2 or steps[0] == "parameters")
-        found[".".join(steps)] = each.key_at if is_named else each.at
+        found[".".join(steps)] = each.key_at() if is_named else each.at()
         pending += [((*steps, key), inside) for key, inside in each.children()]
     return found
 
@@ -132,7 +189,7 @@ def _is_ipv4_group(text: str) -> bool:
 
 
 def build_connections(
-    node: Cursor, interface: Interface, found: list[Diagnostic]
+    node: Document, interface: Interface, found: list[Diagnostic]
 ) -> tuple[ConnectionDeclaration, ...]:
     """Build the connections that a node's section spells out.
 
@@ -144,43 +201,34 @@ def build_connections(
     return tuple(
         ConnectionDeclaration(
             name=name,
-            urls=_urls(cursor, found),
-            map=_map(cursor, interface),
-            at=cursor.key_at,
+            urls=tuple(url for part in each.items("urls") if (url := _url(part, found))),
+            map=_map(each, interface),
+            at=each.key_at(),
         )
-        for name, cursor in node.entries("connections")
+        for name, each in node.entries("connections")
     )
 
 
-def _urls(connection: Cursor, found: list[Diagnostic]) -> tuple[ConnectionUrl, ...]:
-    urls = []
-    for cursor in connection.items("urls"):
-        url = _url(cursor, found)
-        if url is not None:
-            urls.append(url)
-    return tuple(urls)
-
-
-def _url(cursor: Cursor, found: list[Diagnostic]) -> ConnectionUrl | None:
+def _url(part: Document, found: list[Diagnostic]) -> ConnectionUrl | None:
     try:
-        return parse(cursor.value.text)
+        return parse(part.root.text)
     except ConnectionUrlError as problem:
-        found.append(error("manifest.connection-url", cursor.at, problem.message, problem.hint))
+        found.append(error("manifest.connection-url", part.at(), problem.message, problem.hint))
         return None
 
 
-def _map(connection: Cursor, interface: Interface) -> tuple[tuple[EndpointKind, str], ...]:
+def _map(connection: Document, interface: Interface) -> tuple[tuple[EndpointKind, str], ...]:
     if connection.text("map") == "all":
         return tuple((each.kind, each.name) for each in interface.endpoints)
     return tuple(
-        (_KINDS[kind], each.value.text)
+        (_KINDS[kind], each.root.text)
         for kind, names in connection.entries("map")
         for each in names.items()
     )
 
 
 def build_interface(
-    node: Cursor, *, base: Path, environment: Mapping[str, str], found: Findings
+    node: Document, *, base: Path, environment: Mapping[str, str], found: Findings
 ) -> Interface:
     """Build the interface of a node, inline or by reference; empty if it has none.
 
@@ -190,19 +238,19 @@ def build_interface(
         environment: for AMENT_PREFIX_PATH, where `nodl://` is searched.
         found: findings are appended here.
     """
-    cursor = node.get("interface")
-    if cursor is None:
+    part = node.get("interface")
+    if part is None:
         return Interface()
-    if isinstance(cursor.value.data, Mapping):
-        return build_inline(cursor, found)
-    reference = cursor.value.text
+    if isinstance(part.root.data, dict):
+        return build_inline(part, found)
+    reference = part.root.text
     try:
         interface, findings = read_interface(
-            reference, base=base, at=cursor.at, environment=environment
+            reference, base=base, at=part.at(), environment=environment
         )
     except OSError as problem:  # a name that is too long, a folder that is not ours to search
         message = f"cannot follow {quote(reference)}: {problem.strerror}"
-        found.append(error("nodl.not-found", cursor.at, message))
+        found.append(error("nodl.not-found", part.at(), message))
         return Interface(source=reference)
     found.extend(findings)
     return interface
@@ -210,10 +258,10 @@ def build_interface(
 
 def build_node(
     key: str,
-    cursor: Cursor,
+    part: Document,
     *,
     base: Path,
-    machine: str,
+    shared: Shared,
     environment: Mapping[str, str],
     found: Findings,
 ) -> Node:
@@ -221,58 +269,58 @@ def build_node(
 
     Args:
         key: its key in the document.
-        cursor: its value.
+        part: its value.
         base: folder that relative paths start from.
-        machine: the machine of a node that names none.
+        shared: what it gets from the document and groups around it.
         environment: for AMENT_PREFIX_PATH.
         found: findings are appended here.
     """
-    namespace = cursor.text("namespace").strip("/")
-    health = cursor.get("health")
-    parameters = build_parameters(cursor, found)
-    interface = build_interface(cursor, base=base, environment=environment, found=found)
-    return cursor.build(
+    node = read_part(part, written.Node)
+    parameters = build_parameters(part, found)
+    interface = build_interface(part, base=base, environment=environment, found=found)
+    built = build(
         Node,
-        key=key,
-        name=cursor.text("name", key),
-        namespace=f"/{namespace}",
-        machine=cursor.text("machine", machine),
-        run=_run(cursor, base, found),
+        node,
+        key=shared.key(key),
+        name=node.name or key,
+        namespace=f"/{shared.within(node.namespace)}",
+        machine=node.machine or shared.machine,
+        process=shared.key(node.process) if node.process else "",
+        run=_run(part, base, shared, found),
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
-        parameter_files=tuple(
-            absolute(base, each.value.text) for each in cursor.items("parameter_files")
-        ),
-        remap=tuple((name, each.value.text) for name, each in cursor.entries("remap")),
-        after=tuple(_after(cursor, found)),
-        timeouts=section(cursor, "timeouts", Timeouts),
-        supervision=cursor.build(Supervision),
-        on_violation=build_on_violation(cursor),
-        health=None if health is None else _health(health),
+        parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
+        remap=tuple(node.remap.items()),
+        after=tuple(_after(part, shared, found)),
+        supervision=build(Supervision, node),
+        on_violation=build_on_violation(part),
+        health=None if node.health is None else _health(node.health),
         interface=interface,
-        flows=tuple(_flows(cursor)),
-        connections=build_connections(cursor, interface, found),
-        positions=positions_of(cursor, {key for key, _ in cursor.entries()} - {"interface"}),
-        written_paths=tuple(_written_paths(cursor)),
-        at=cursor.key_at,
+        flows=tuple(_flows(part)),
+        connections=build_connections(part, interface, found),
+        positions=positions_of(part, {key for key, _ in part.entries()} - {"interface"}),
+        written_paths=tuple(_written_paths(node)),
+        at=part.key_at(),
     )
+    return shared.given_to(built)
 
 
-def _after(node: Cursor, found: Findings) -> Iterator[After]:
-    for key, each in node.entries("after"):
-        if not isinstance(each.value.data, Mapping):
-            yield After(node=key, condition=Condition(each.scalar), at=each.key_at)
+def _after(node: Document, shared: Shared, found: Findings) -> Iterator[After]:
+    for name, each in node.entries("after"):
+        key = shared.key(name)
+        if not isinstance(each.root.data, dict):
+            yield After(node=key, condition=Condition(each.scalar), at=each.key_at())
             continue
-        for word, cursor in each.entries():
+        for word, shown in each.entries():
             by, names = ReadyBy(word), list[tuple[str, ParameterValue | None, Position]]()
-            if isinstance(cursor.value.data, Mapping):
-                values = _flat(cursor.entries(), found)
+            if isinstance(shown.root.data, dict):
+                values = flat_parameters(shown.entries(), found)
                 names += [(name, value, at) for name, (value, at) in values.items()]
             else:
                 so = True if by is ReadyBy.PARAMETER else None
-                items = cursor.items() if isinstance(cursor.value.data, tuple) else (cursor,)
-                names += [(each.value.text, so, each.at) for each in items]
-            for name, value, at in names:
-                yield After(node=key, condition=Readiness(by=by, name=name, value=value), at=at)
+                items = shown.items() if isinstance(shown.root.data, tuple) else (shown,)
+                names += [(each.root.text, so, each.at()) for each in items]
+            for named, value, at in names:
+                yield After(node=key, condition=Readiness(by=by, name=named, value=value), at=at)
 
 
 def absolute(base: Path, path: str) -> str:
@@ -281,222 +329,169 @@ def absolute(base: Path, path: str) -> str:
     return os.path.abspath(base / path)  # noqa: PTH100
 
 
-def _run(node: Cursor, base: Path, found: Findings) -> Run:
-    cursor = node.get("run")
-    if cursor is None:
-        return Run(kind=RunKind.ATTACH)
-    kind = RunKind.COMMAND
-    if "python" in cursor:
-        kind = RunKind.PYTHON
-        _refuse(cursor, ("ros_args",), "a Python class: our host gives it no command line", found)
-    elif "component" in cursor:
-        kind = RunKind.ATTACH
-        _refuse(cursor, PROCESS_KEYS, "a component: its container's process has that", found)
-    elif "attach" in cursor:
-        kind = RunKind.ATTACH
-        _refuse(cursor, PROCESS_KEYS, "an attached node", found)
-    if "component" not in cursor:
-        _refuse(cursor, ("extra_arguments",), "what is no component", found)
-    _check_python_keys(cursor, kind, found)
-    folder = cursor.text("working_directory")
-    return cursor.build(
-        Run,
-        kind=kind,
-        arguments=_values(cursor, "arguments", found),
-        extra_arguments=_values(cursor, "extra_arguments", found),
-        environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
-        working_directory=absolute(base, folder) if folder else "",
-        prefix=_words(cursor, "prefix", found),
-        limits=section(cursor, "limits", Limits) if "limits" in cursor else None,
-        resources=_resources(cursor, found),
-    )
-
-
-def _resources(run: Cursor, found: Findings) -> Resources | None:
-    cursor = run.get("resources")
-    if cursor is None:
-        return None
-    built = cursor.build(Resources, at=cursor.key_at)
-    high, most = built.memory_high_mib, built.memory_max_mib
-    if high is not None and most is not None and high >= most:
-        at = cursor.document.key_at((*cursor.place, "memory_high_mib"))
-        message = f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
-        found.append(error("manifest.resources", at, message, "set it lower, or leave it out"))
-    return built
-
-
-def _values(run: Cursor, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
-    values = ((name, _parameter(name, each, found)) for name, each in run.entries(key))
-    return tuple((name, value) for name, value in values if value is not None)
-
-
-def _refuse(run: Cursor, names: tuple[str, ...], what: str, found: Findings) -> None:
-    """Report keys of `run` that have no meaning for this way to run a node."""
-    for name in names:
-        if name in run:
-            at = run.document.key_at((*run.place, name))
-            message = f"cannot set {name} of {what}"
-            found.append(error("manifest.attach", at, message, "remove it"))
-
-
-def _words(run: Cursor, key: str, found: Findings) -> tuple[str, ...]:
-    """Return the words of a list, or of a text as a shell splits it."""
-    cursor = run.get(key)
-    if cursor is None:
-        return ()
-    if isinstance(cursor.value.data, tuple):
-        return tuple(each.value.text for each in cursor.items())
-    try:
-        return tuple(shlex.split(cursor.value.text))
-    except ValueError as problem:
-        message = f"cannot split {key} {quote(cursor.value.text)} into words: {problem}"
-        hint = "close the quotation, or write a list of words"
-        found.append(error("manifest.words", cursor.at, message, hint))
-        return ()
-
-
 _OF_PYTHON = ("arguments", "executor", "threads")
 
 
-def _check_python_keys(cursor: Cursor, kind: RunKind, found: Findings) -> None:
-    for name in _OF_PYTHON:
-        if name not in cursor:
-            continue
-        at = cursor.document.key_at((*cursor.place, name))
-        if kind is not RunKind.PYTHON:
-            message = f"cannot set {name} of what is not 'run: {{python: …}}'"
-            found.append(error("manifest.python-only", at, message, "remove it"))
-        elif name == "threads" and cursor.text("executor") != Executor.MULTI.value:
-            message = "cannot give threads to an executor that has one"
-            hint = "write 'executor: multi', or remove it"
-            found.append(error("manifest.threads", at, message, hint))
+def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
+    part = node.get("run")
+    if part is None:
+        return Run(kind=RunKind.ATTACH)
+    run = read_part(part, written.Run)
+    kind = RunKind.COMMAND
+    if run.python:
+        kind = RunKind.PYTHON
+        _refuse(part, ("ros_args",), "a Python class: our host gives it no command line", found)
+    elif run.component:
+        kind = RunKind.ATTACH
+        _refuse(part, PROCESS_KEYS, "a component: its container's process has that", found)
+    elif run.attach:
+        kind = RunKind.ATTACH
+        _refuse(part, PROCESS_KEYS, "an attached node", found)
+    if not run.component:
+        _refuse(part, ("extra_arguments",), "what is no component", found)
+    if kind is not RunKind.PYTHON:
+        rule = "manifest.python-only"
+        _refuse(part, _OF_PYTHON, "what is not 'run: {python: …}'", found, rule=rule)
+    elif run.threads and run.executor is not Executor.MULTI:
+        message = "cannot give threads to an executor that has one"
+        hint = "write 'executor: multi', or remove it"
+        found.append(error("manifest.threads", part.key_at(("threads",)), message, hint))
+    return build(
+        Run,
+        run,
+        kind=kind,
+        command=tuple(each.root.text for each in part.items("command")),
+        arguments=_values(part, "arguments", found),
+        extra_arguments=_values(part, "extra_arguments", found),
+        environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
+        working_directory=absolute(base, run.working_directory) if run.working_directory else "",
+        prefix=_words(part, "prefix", found),
+        resources=_resources(part, run, found),
+        container=_container(run.container or "", shared),
+    )
 
 
-def build_modes(root: Cursor, found: Findings) -> tuple[Mode, ...]:
+def _container(name: str, shared: Shared) -> str:
+    """Return the container of a component: a full name, or the key of a node of the system."""
+    return name if not name or name.startswith("/") else shared.key(name)
+
+
+def _resources(part: Document, run: written.Run, found: Findings) -> Resources | None:
+    if run.resources is None:
+        return None
+    high, most = run.resources.memory_high_mib, run.resources.memory_max_mib
+    if high is not None and most is not None and high >= most:
+        at = part.key_at(("resources", "memory_high_mib"))
+        message = f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
+        found.append(error("manifest.resources", at, message, "set it lower, or leave it out"))
+    return build(Resources, run.resources, at=part.key_at(("resources",)))
+
+
+def _values(run: Document, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
+    values = ((name, parameter_value(name, each, found)) for name, each in run.entries(key))
+    return tuple((name, value) for name, value in values if value is not None)
+
+
+def _refuse(
+    run: Document,
+    names: tuple[str, ...],
+    what: str,
+    found: Findings,
+    *,
+    rule: str = "manifest.attach",
+) -> None:
+    """Report keys of `run` that have no meaning for this way to run a node."""
+    for name in names:
+        if name in run:
+            message = f"cannot set {name} of {what}"
+            found.append(error(rule, run.key_at((name,)), message, "remove it"))
+
+
+def _words(run: Document, key: str, found: Findings) -> tuple[str, ...]:
+    """Return the words of a list, or of a text as a shell splits it."""
+    part = run.get(key)
+    if part is None:
+        return ()
+    if isinstance(part.root.data, tuple):
+        return tuple(each.root.text for each in part.items())
+    try:
+        return tuple(shlex.split(part.root.text))
+    except ValueError as problem:
+        message = f"cannot split {key} {quote(part.root.text)} into words: {problem}"
+        hint = "close the quotation, or write a list of words"
+        found.append(error("manifest.words", part.at(), message, hint))
+        return ()
+
+
+def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
     """Build the modes of a document."""
     return tuple(
         Mode(
             name=name,
-            inactive=tuple(each.value.text for each in cursor.items("inactive")),
+            inactive=tuple(each.root.text for each in mode.items("inactive")),
             parameters=tuple(
                 ModeParameter(node=key, name=parameter, value=value, at=at)
-                for key, node in cursor.entries("parameters")
-                for parameter, (value, at) in _flat(node.entries(), found).items()
+                for key, node in mode.entries("parameters")
+                for parameter, (value, at) in flat_parameters(node.entries(), found).items()
             ),
-            at=cursor.key_at,
+            at=mode.key_at(),
         )
-        for name, cursor in root.entries("modes")
+        for name, mode in root.entries("modes")
     )
 
 
-def build_parameters(node: Cursor, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
-    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
-    return _flat(node.entries("parameters"), found)
+def _health(health: written.Health) -> Health:
+    patterns = health.diagnostics or ()
+    return build(Health, health, diagnostics=(patterns,) if isinstance(patterns, str) else patterns)
 
 
-def _flat(
-    entries: Iterable[tuple[str, Cursor]], found: Findings
-) -> dict[str, tuple[ParameterValue, Position]]:
-    flat: dict[str, tuple[ParameterValue, Position]] = {}
-    pending = list(reversed(list(entries)))
-    while pending:
-        name, cursor = pending.pop()
-        if isinstance(cursor.value.data, Mapping):
-            inner = [(f"{name}.{key}", each) for key, each in cursor.entries()]
-            pending.extend(reversed(inner))
-            continue
-        if name in flat:
-            message = f"cannot set the parameter {name!r} twice"
-            first = flat[name][1]
-            hint = f"the first value stands at {first.spelled}"
-            found.append(error("manifest.duplicate-parameter", cursor.at, message, hint))
-            continue
-        value = _parameter(name, cursor, found)
-        if value is not None:
-            flat[name] = (value, cursor.key_at)
-    return flat
-
-
-def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | None:
-    if isinstance(cursor.value.data, tuple):
-        return scalar_tuple(cursor, found)
-    text = cursor.value.text
-    if not cursor.value.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
-        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
-        hint = f'write {name}: true or false, or {name}: "{text}"'
-        found.append(note("manifest.yaml-1.1-boolean", cursor.at, message, hint))
-    if not cursor.value.quoted and has_leading_zero(text):
-        message = f"cannot tell which number {text} is meant as; it is read as a string"
-        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
-        found.append(note("manifest.leading-zero", cursor.at, message, hint))
-    return cursor.scalar
-
-
-def _health(cursor: Cursor) -> Health:
-    patterns = cursor.get("diagnostics")
-    if patterns is None or isinstance(patterns.value.data, tuple):
-        return cursor.build(Health)
-    return cursor.build(Health, diagnostics=(patterns.value.text,))
-
-
-def _flows(node: Cursor) -> list[FlowNeed]:
-    needs = []
+def _flows(node: Document) -> Iterator[FlowNeed]:
     for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
-        for name, cursor in node.entries("flows", kind.value):
-            wanted = written.read(cursor.value.plain(), PublisherFlow, strict=False)
-            five_qi = wanted.five_qi
-            needs.append(
-                cursor.build(
-                    FlowNeed,
-                    kind=kind,
-                    name=name,
-                    dscp=None if wanted.dscp is None else wanted.dscp.value,
-                    five_qi=None if five_qi == "auto" else five_qi,
-                    five_qi_auto=five_qi == "auto",
-                    rate_hz=_carried_hz(wanted.rate_hz),
-                    quantities=quantities(cursor),
-                    at=cursor.key_at,
-                )
+        for name, part in node.entries("flows", kind.value):
+            flow = read_part(part, PublisherFlow)
+            rate, five_qi = flow.rate_hz, flow.five_qi
+            yield build(
+                FlowNeed,
+                flow,
+                kind=kind,
+                name=name,
+                dscp=None if flow.dscp is None else flow.dscp.value,
+                five_qi=None if five_qi == "auto" else five_qi,
+                five_qi_auto=five_qi == "auto",
+                rate_hz=rate.max or rate.min if isinstance(rate, Rate) else rate,
+                quantities=tuple(quantities(part, flow)),
+                at=part.key_at(),
             )
-    return needs
-
-
-def _carried_hz(rate: float | Rate | None) -> float | None:
-    """Return the messages per second that a network must carry."""
-    return rate.max or rate.min if isinstance(rate, Rate) else rate
 
 
 _QUANTITIES = ("max_delay_ms", "loss", "max_silence_s", "max_message_size", "five_qi")
 """Numbers of a flow or a link that nothing but a measurement could prove; and its rate."""
 
 
-def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
-    """Return the numbers of a flow or a link that only a measurement could prove.
+def quantities(part: Document, keys: MeasuredKeys) -> Iterator[Quantity]:
+    """Yield the numbers of a flow or a link that only a measurement could prove.
 
     `five_qi: auto` is none: it follows from the others.
+
+    Args:
+        part: where they are written.
+        keys: what is written there.
     """
-    found = []
-    share = cursor.get("quantile")
-    quantile = QUANTILE if share is None else float(share.value.text)
     for name in _QUANTITIES:
-        value = cursor.get(name)
-        if value is not None and isinstance(value.scalar, (int, float)):
-            of = quantile if name == "max_delay_ms" else QUANTILE
-            found.append(Quantity(name=name, value=value.scalar, at=value.at, quantile=of))
-    rate = cursor.get("rate_hz")
-    if rate is not None and isinstance(rate.value.data, Mapping):
-        both = rate.build(Rate)
-        found.append(Quantity(name="rate_hz", value=both.min or 0.0, most=both.max, at=rate.at))
+        value = getattr(keys, name, None)
+        if isinstance(value, (int, float)):
+            of = keys.quantile if name == "max_delay_ms" else QUANTILE
+            yield Quantity(name=name, value=value, at=part.at((name,)), quantile=of)
+    rate, at = keys.rate_hz, part.at(("rate_hz",))
+    if isinstance(rate, Rate):
+        yield Quantity(name="rate_hz", value=rate.min or 0.0, most=rate.max, at=at)
     elif rate is not None:
-        hertz = float(rate.value.text)
-        found.append(Quantity(name="rate_hz", value=hertz, slack=RATE_SLACK, at=rate.at))
-    return tuple(found)
+        yield Quantity(name="rate_hz", value=rate, slack=RATE_SLACK, at=at)
 
 
-def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:
+def _written_paths(node: written.Node) -> Iterator[tuple[str, str]]:
     """Yield the paths of a node as they are written, by place."""
-    for index, each in enumerate(node.items("parameter_files")):
-        yield f"parameter_files.{index}", each.value.text
-    run = node.get("run")
-    if run is not None and "working_directory" in run:
-        yield "run.working_directory", run.text("working_directory")
+    for index, each in enumerate(node.parameter_files):
+        yield f"parameter_files.{index}", each
+    if node.run is not None and node.run.working_directory:
+        yield "run.working_directory", node.run.working_directory

@@ -1,21 +1,18 @@
-"""Effective flow needs of endpoints: DSCP, 5QI, size and transport after mappings, links and types.
+"""Effective flow needs of endpoints: DSCP, 5QI, datagrams and transport after mappings and links.
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
 `lifecycle.network`); the ways to a DSCP besides writing it: a TRANSPORT_PRIORITY through its
-mapping, a 5QI through a mapping, and a value of its own where the DSCP is the identifier. Reads
-interface definitions; starts nothing.
+mapping, a 5QI through a mapping, and a value of its own where the DSCP is the identifier. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.manifest.installed_types import bounded_size
 from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
@@ -65,14 +62,14 @@ class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
     issues: tuple[ClassIssue, ...] = ()
 
 
-def class_of(need: FlowNeed, *, max_delay_ms: float | None, message_bytes: int | None) -> FlowClass:
+def class_of(need: FlowNeed, *, max_delay_ms: float | None) -> FlowClass:
     """Return the class of one publisher's flow.
 
     Args:
         need: what it asks for; a declared `rate_hz` asks for a guaranteed rate.
         max_delay_ms: declared, else that of its links; None without.
-        message_bytes: of its largest message; None if not known.
     """
+    message_bytes = need.max_message_size
     rate_bps = (
         need.rate_hz * message_bytes * 8
         if need.rate_hz is not None and message_bytes is not None
@@ -217,7 +214,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         marking: DSCP, of a publisher's data or of a subscription's acknowledgements.
         flow_class: 5QI; publishers only.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
-        max_message_size: declared, else the type's bound, bytes; None without either.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
         transports: all that its participant may use; empty for any.
@@ -231,7 +227,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     marking: Marking
     flow_class: FlowClass
     max_delay_ms: float | None = None
-    max_message_size: int | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
     identified_by_receiver: bool = False
@@ -275,9 +270,8 @@ class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
 class FlowNeeds:
     """All flow needs of a system, resolved."""
 
-    def __init__(self, manifest: Manifest, prefixes: Sequence[Path]) -> None:
+    def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
-        self._prefixes = prefixes
         self._machines = {each.key: each.machine for each in manifest.nodes}
         self._delays: dict[tuple[str, str], float] = {}
         for link in manifest.links:
@@ -286,7 +280,6 @@ class FlowNeeds:
                 self._delays[place] = min(
                     link.max_delay_ms, self._delays.get(place, link.max_delay_ms)
                 )
-        self._sizes: dict[str, int | None] = {}
         self._identified_by_receiver = _identified_by_receiver(manifest)
         resolved = {
             (node.key, need.kind, need.name): self._resolve(node, need)
@@ -360,8 +353,8 @@ class FlowNeeds:
 
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
         topic = topic_of(node, need.name, need.kind)
-        delay, size = self._max_delay_ms(node, need, topic), self._max_message_size(node, need)
-        flow_class = class_of(need, max_delay_ms=delay, message_bytes=size)
+        delay = self._max_delay_ms(node, need, topic)
+        flow_class = class_of(need, max_delay_ms=delay)
         return ResolvedNeed(
             need=need,
             topic=topic,
@@ -369,7 +362,6 @@ class FlowNeeds:
             marking=marking_of(need, self._manifest.network, flow_class.five_qi),
             flow_class=flow_class,
             max_delay_ms=delay,
-            max_message_size=size,
             transports=self._transports(node) if self._by_participant(need) else (),
             identified_by_receiver=topic in self._identified_by_receiver,
         )
@@ -378,16 +370,6 @@ class FlowNeeds:
         if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
             return need.max_delay_ms
         return self._delays.get((node.key, topic))
-
-    def _max_message_size(self, node: Node, need: FlowNeed) -> int | None:
-        if need.max_message_size is not None or need.kind is not EndpointKind.PUBLISHER:
-            return need.max_message_size
-        endpoint = node.interface.find(need.kind, need.name)
-        if endpoint is None:
-            return None
-        if endpoint.type not in self._sizes:
-            self._sizes[endpoint.type] = bounded_size(endpoint.type, self._prefixes)
-        return self._sizes[endpoint.type]
 
     def _by_participant(self, need: FlowNeed) -> bool:
         """Whether the need is met by what its participant may use, with no connection at all.
@@ -411,7 +393,7 @@ class FlowNeeds:
         declared = self._manifest.network.max_datagram_bytes
         ipv6 = ":" in self._manifest.address_of(self._machines[node_key])
         limit = declared or max_unfragmented(ipv6=ipv6)
-        size = each.max_message_size
+        size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)
         if small:

@@ -1,13 +1,10 @@
-"""Installed packages, interface types, type hashes (REP-2016) and upper bounds of message sizes.
+"""Installed packages, interface types and type hashes (REP-2016).
 
 Owns: where the ament resource index is and how a resource is found in it, as ament_index_python
 does, but for a prefix that AMENT_PREFIX_PATH need not name: wheels install the index under
 `sys.prefix`. The three answers to "is there a `sensor_msgs/msg/Image`?". The type hash of an
 interface, from the `share/<package>/<kind>/<Type>.json` that rosidl installs beside every
 definition, and how the hashes of a service's and an action's messages are put together.
-
-And the upper bound of a type's serialized size, from the same file, which describes each field
-(type_description_interfaces/msg/FieldType).
 
 Imports no message package, so that a manifest is checked without ROS installed or sourced. Reads
 the file system.
@@ -166,114 +163,3 @@ def _description(type_: str, prefixes: Sequence[Path]) -> Any:
         return json.loads((index.parents[3] / package / f"{rest}.json").read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-
-
-_ENCAPSULATION = 4
-"""Bytes in front of every serialized message (DDSI-RTPS 10)."""
-
-_LENGTH = 4
-_WCHAR = 4
-_SIZES = {
-    **dict(enumerate((1, 1, 2, 2, 4, 4, 8, 8, 4, 8), start=2)),  # int8 … uint64, float, double
-    13: 1,
-    14: _WCHAR,
-    15: 1,
-    16: 1,  # char, wchar, boolean, byte
-}
-_CHARACTERS = {21: 1, 22: _WCHAR}
-_NESTED = 1
-_FORM, _ARRAY, _BOUNDED = 48, 1, 2
-"""type_description_interfaces/msg/FieldType: bytes by type id, bytes of a character by that of a
-bounded string, and in steps of 48 a type's array, its bounded and its unbounded sequence."""
-
-_MAX_DEPTH = 32
-_EXACT_ITEMS = 64  # items of an array that are laid out one by one before padding is estimated
-
-
-class _UnboundedError(Exception):
-    """A field has no bound, or its type cannot be read here."""
-
-
-def bounded_size(type_: str, prefixes: Sequence[Path]) -> int | None:
-    """Return the largest serialized size of a message type, bytes; None if it has no bound.
-
-    None also if the type is not installed here or its definition cannot be read. CDR aligns fields
-    by what precedes them, so after a field of variable length the largest padding is counted.
-
-    Args:
-        type_: `package/msg/Type`.
-        prefixes: where to search, from `installed_types.search_prefixes`.
-    """
-    layout = _Layout()
-    try:
-        _add(type_, layout, prefixes, 0)
-    except (_UnboundedError, KeyError, TypeError):  # or a description that is none
-        return None
-    return _ENCAPSULATION + layout.offset
-
-
-class _Layout(msgspec.Struct):
-    """Bytes so far; `exact` while every message of the type has this very offset here."""
-
-    offset: int = 0
-    exact: bool = True
-
-    def align(self, to: int) -> None:
-        self.offset += -self.offset % to if self.exact else to - 1
-
-    def put(self, size: int, count: int = 1) -> None:
-        if count:
-            self.align(size)
-            self.offset += size * count
-
-
-def _add(type_: str, layout: _Layout, prefixes: Sequence[Path], depth: int) -> None:
-    if depth == _MAX_DEPTH:
-        raise _UnboundedError
-    fields = _description(type_, prefixes)["type_description_msg"]["type_description"]["fields"]
-    for each in fields:
-        _add_field(each["type"], layout, prefixes, depth)
-    if not fields:
-        layout.put(1)  # rosidl puts a member into an empty structure
-
-
-def _add_field(
-    field: Mapping[str, Any], layout: _Layout, prefixes: Sequence[Path], depth: int
-) -> None:
-    form, of = divmod(_count(field["type_id"]), _FORM)
-    if form > _BOUNDED:
-        raise _UnboundedError
-    count = _count(field["capacity"]) if form else 1
-    if form == _BOUNDED:
-        layout.put(_LENGTH)
-    if of in _CHARACTERS:
-        _repeat_text(layout, _CHARACTERS[of] * (_count(field["string_capacity"]) + 1), count)
-    elif of == _NESTED:
-        _repeat(str(field["nested_type_name"]), layout, count, prefixes, depth)
-    else:
-        layout.put(_SIZES[of], count)
-    layout.exact = layout.exact and form != _BOUNDED
-
-
-def _count(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise _UnboundedError
-    return value
-
-
-def _repeat_text(layout: _Layout, content: int, count: int) -> None:
-    for _ in range(min(count, 1)):
-        layout.put(_LENGTH)
-        layout.offset += content
-        layout.exact = False
-    layout.offset += max(count - 1, 0) * (_LENGTH + _LENGTH - 1 + content)
-
-
-def _repeat(type_: str, layout: _Layout, count: int, prefixes: Sequence[Path], depth: int) -> None:
-    for _ in range(min(count, _EXACT_ITEMS)):
-        _add(type_, layout, prefixes, depth + 1)
-    if count > _EXACT_ITEMS:
-        one = _Layout(exact=False)
-        _add(type_, one, prefixes, depth + 1)
-        layout.offset += one.offset * (count - _EXACT_ITEMS)
-        layout.exact = False

@@ -1,10 +1,10 @@
-"""Load a manifest file: parse, substitute, validate, build, join includes, check. The entry point.
+"""Load a manifest file: parse, substitute, validate, build, add includes, check. The entry point.
 
 Owns: `load`: the run of source → arguments and schema → build for a manifest and everything it
-includes, then of the checks; what one document declares, before it is joined with others by
-`include`. A phase that finds errors reports all that it finds and is the last one. It is imported
-when `load` is asked for: a process that hosts a node needs a manifest's types, but never YAML nor
-JSON Schema, and those are half of what it would import.
+includes, then of the checks. Documents and groups are walked from the outside in; each node is
+built with what is around it (`Shared`). A phase that finds errors reports all that it finds and is
+the last one. It is imported when `load` is asked for: a process that hosts a node needs a
+manifest's types, but never YAML nor JSON Schema, and those are half of what it would import.
 Touches the file system; needs no ROS.
 """
 
@@ -21,11 +21,11 @@ from msgspec.structs import replace
 from lifecycle.manifest.building import (
     build_data_layer,
     build_modes,
+    build_network,
     build_node,
     build_on_violation,
     positions_of,
     quantities,
-    section,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import (
@@ -35,170 +35,28 @@ from lifecycle.manifest.diagnostics import (
     Severity,
     in_order,
 )
-from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
     Discovery,
+    EndpointKind,
     Link,
+    LinkKeys,
     Machine,
     Manifest,
-    Network,
     Node,
     Policy,
 )
+from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.shared import Shared, settle
+from lifecycle.manifest.shared import THIS_HOST, Shared, settle
+from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import Substituted, substitute
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, note
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
-from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 from lifecycle.network.nfe import canonical, parse_address
-
-_MAX_MAPPING_BYTES = 1_000_000
-
-
-def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Network:
-    """Build the network of a document; the defaults where it declares nothing.
-
-    Args:
-        root: the document.
-        base: folder that the path of a mapping starts from.
-        found: findings are appended here.
-    """
-    cursor = root.get("network")
-    if cursor is None:
-        return Network()
-    return cursor.build(
-        Network,
-        transport_priority_mapping=_priority_mapping(cursor, found),
-        five_qi_dscp=_dscp_mapping(cursor, base, found),
-    )
-
-
-def _priority_mapping(network: Cursor, found: list[Diagnostic]) -> TransportPriorityMapping | None:
-    cursor = network.get("transport_priority_mapping")
-    if cursor is None:
-        return None
-    try:
-        return cursor.build(TransportPriorityMapping)
-    except ValueError as problem:
-        message, _, hint = str(problem).partition("; ")
-        found.append(error("manifest.transport-priority", cursor.at, message, hint))
-        return None
-
-
-def _dscp_mapping(network: Cursor, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
-    """Read a mapping: a published one by its name, else a file."""
-    cursor = network.get("five_qi_dscp")
-    if cursor is None:
-        return None
-    name = cursor.value.text
-    shipped = {each.name: each for each in dscp_mappings()}
-    if name in shipped:
-        return shipped[name]
-    try:
-        with (base / name).open("rb") as file:
-            text = file.read(_MAX_MAPPING_BYTES)
-    except (OSError, ValueError) as problem:
-        why = getattr(problem, "strerror", None) or str(problem)
-        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {why}"
-        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
-        found.append(error("manifest.five-qi-dscp", cursor.at, message, hint))
-        return None
-    try:
-        return parse_mapping(text)
-    except ValueError as problem:
-        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {problem.__cause__}"
-        hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
-        found.append(error("manifest.five-qi-dscp", cursor.at, message, hint))
-        return None
-
-
-THIS_HOST = "local"
-"""Name of the machine of nodes that name none; declared implicitly, without address."""
-
-
-_SECTIONS = ("discovery", "network", "data_layer", "on_violation")
-"""Sections of a document that findings may be about."""
-
-
-def build_manifest(
-    root: Cursor,
-    *,
-    path: str,
-    arguments: tuple[tuple[str, str], ...],
-    base: Path,
-    environment: Mapping[str, str],
-    found: Findings,
-    machine: str = THIS_HOST,
-) -> Manifest:
-    """Build what one document or group declares, its includes and groups not yet joined.
-
-    Args:
-        root: a document that fits the schema, or a group of one.
-        path: as the user wrote it.
-        arguments: resolved values by name.
-        base: folder that its relative paths start from.
-        environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
-        found: findings are appended here.
-        machine: of nodes that name none, where the group names none either.
-    """
-    machine = root.text("machine", machine)
-    nodes = tuple(
-        build_node(key, cursor, base=base, machine=machine, environment=environment, found=found)
-        for key, cursor in root.entries("nodes")
-    )
-    return Manifest(
-        path=path,
-        arguments=arguments,
-        system=root.text("system"),
-        description=root.text("description"),
-        machines=_machines(root, nodes, found),
-        discovery=section(root, "discovery", Discovery),
-        network=build_network(root, base=base, found=found),
-        data_layer=build_data_layer(root, found),
-        policy=section(root, "policy", Policy),
-        on_violation=build_on_violation(root),
-        modes=build_modes(root, found),
-        nodes=nodes,
-        links=tuple(_link(each) for each in root.items("links")),
-        positions={
-            **positions_of(root, _SECTIONS),
-            **{key: each.key_at for key in _SECTIONS if (each := root.get(key)) is not None},
-        },
-    )
-
-
-def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[Machine, ...]:
-    machines = []
-    for name, cursor in root.entries("machines"):
-        address = canonical(cursor.text("address"))
-        if address and parse_address(address) is None:
-            at = root.document.at((*cursor.place, "address"))
-            message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
-            hint = "look the name up: a plan must not depend on a name server"
-            found.append(error("manifest.address", at, message, hint))
-        machines.append(Machine(name=name, address=address, at=cursor.key_at))
-    if THIS_HOST not in {each.name for each in machines}:
-        here = next((node for node in nodes if node.machine == THIS_HOST), None)
-        if here is not None:
-            machines.append(Machine(name=THIS_HOST, at=here.at))
-    return tuple(machines)
-
-
-def _link(cursor: Cursor) -> Link:
-    return cursor.build(
-        Link,
-        from_node=cursor.text("from"),
-        to_node=cursor.text("to"),
-        quantities=quantities(cursor),
-        at=cursor.at,
-    )
-
 
 _NONE: Mapping[str, str] = MappingProxyType({})
 
@@ -239,8 +97,8 @@ def load(
     variables = os.environ if environment is None else environment
     origin = include.Origin.of(Path(path))
     loading = _Loading(variables, Programs(variables) if run_commands else None)
-    manifest = loading.read(origin, arguments, ())
-    found = loading.found
+    loading.read(origin, arguments)
+    manifest, found = loading.manifest(), loading.found
 
     def every() -> tuple[Diagnostic, ...]:
         return in_order(found, loading.files)
@@ -292,18 +150,18 @@ def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
         ManifestError: it cannot be read, or its `arguments:` are none.
     """
     document = read_document(path, shown=os.fspath(path))
-    wrong = [each for place, each in validate(document) if place[:1] == ("arguments",)]
+    wrong = [each for each in validate(document) if each.at.path.startswith("arguments")]
     if wrong:
         raise ManifestError(in_order(wrong, [document.file]))
     return tuple(
         ArgumentDeclaration(
             name=name,
-            default=cursor.text("default") if "default" in cursor else None,
-            choices=tuple(each.value.text for each in cursor.items("choices")),
-            description=cursor.text("description"),
-            at=cursor.key_at,
+            default=each.text("default") if "default" in each else None,
+            choices=tuple(choice.root.text for choice in each.items("choices")),
+            description=each.text("description"),
+            at=each.key_at(),
         )
-        for name, cursor in Cursor.root(document).entries("arguments")
+        for name, each in document.entries("arguments")
     )
 
 
@@ -342,6 +200,10 @@ SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
 
 
+_SECTIONS = ("discovery", "network", "data_layer", "on_violation")
+"""Sections of a document that findings may be about."""
+
+
 class _Reading(msgspec.Struct, frozen=True, kw_only=True):
     """One file while it is read: places in it are counted from its root.
 
@@ -350,16 +212,11 @@ class _Reading(msgspec.Struct, frozen=True, kw_only=True):
         left_out: places that conditions leave out.
     """
 
-    origin: include.Origin
     chain: tuple[include.Origin, ...]
     left_out: tuple[Place, ...]
 
-    def leaves_out(self, each: Cursor) -> bool:
-        """Whether an entry of `include` or `groups` is left out."""
-        return (*each.document.place, *each.place) in self.left_out
 
-
-NOTHING = Shared(machine=THIS_HOST)
+NOTHING = Shared()
 
 
 class _Loading:
@@ -377,34 +234,45 @@ class _Loading:
         self._programs = programs
         self._documents = 0
         self._outermost: Manifest | None = None
+        self._nodes: dict[str, Node] = {}
+        self._machines: dict[str, Machine] = {}
+        self._links: list[Link] = []
+        self._left_out: list[str] = []
+
+    def manifest(self) -> Manifest | None:
+        """Return what was read; None if the outermost document cannot be used."""
+        return self._outermost and replace(
+            self._outermost,
+            machines=tuple(self._machines.values()),
+            nodes=tuple(self._nodes.values()),
+            links=tuple(self._links),
+            left_out=tuple(self._left_out),
+        )
 
     def read(
         self,
         origin: include.Origin,
         given: Mapping[str, str],
-        chain: tuple[include.Origin, ...],
         *,
-        entry: Cursor | None = None,
-        shared: Shared = NOTHING,
-    ) -> Manifest | None:
+        chain: tuple[include.Origin, ...] = (),
+        entry: Document | None = None,
+        around: Shared = NOTHING,
+    ) -> None:
         """Read one manifest and what it includes.
 
         Args:
             origin: the file.
             given: argument values.
             chain: the manifests that include it, outermost first.
-            entry: the include that names it.
-            shared: what the including manifests and groups share.
-
-        Returns:
-            What is declared; None if the file cannot be read or does not fit the schema.
+            entry: the include that names it; None for the outermost.
+            around: what the including manifests and groups give its nodes.
         """
         self.files.append(origin.shown)
         try:
             document = read_document(origin.path, shown=origin.shown)
         except ManifestError as problem:
             self.found += problem.diagnostics
-            return None
+            return
         self._check_suffix(document)
         before = len(self.found)
         substituted = self._substituted(document, origin, given, entry)
@@ -412,36 +280,58 @@ class _Loading:
         emptied = [
             place[:-1]
             for place in substituted.left_out
-            if (around := document.find(place[:-1])) is not None and not around.data
+            if (around_it := document.find(place[:-1])) is not None and not around_it.data
         ]
         ignore = [*substituted.broken, *substituted.left_out, *emptied]
-        self.found += [each for _, each in validate(document, ignore=ignore)]
+        self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
-            return None
-        root = Cursor.root(document)
-        manifest = build_manifest(
-            root,
+            return
+        self._system(document, origin, substituted.arguments)
+        for name, each in document.entries("machines"):
+            self._machine(name, each)
+        first_link = len(self._links)
+        reading = _Reading(chain=(*chain, origin), left_out=substituted.left_out)
+        self._contents(reading, document, around, entry)
+        links = [self._link(each, around) for each in document.items("links")]
+        self._links[first_link:first_link] = links
+
+    def _system(
+        self, document: Document, origin: include.Origin, arguments: tuple[tuple[str, str], ...]
+    ) -> None:
+        """Build what is declared of the whole system: the outermost manifest's holds."""
+        base = origin.path.parent
+        declared = Manifest(
             path=origin.shown,
-            arguments=substituted.arguments,
-            base=origin.path.parent,
-            environment=self._environment,
-            found=self.found,
-            machine=shared.machine,
+            arguments=arguments,
+            system=document.text("system"),
+            description=document.text("description"),
+            discovery=read_part(document, Discovery, ("discovery",)),
+            network=build_network(document, base=base, found=self.found),
+            data_layer=build_data_layer(document, self.found),
+            policy=read_part(document, Policy, ("policy",)),
+            on_violation=build_on_violation(document),
+            modes=build_modes(document, self.found),
+            positions={
+                **positions_of(document, _SECTIONS),
+                **{key: document.key_at((key,)) for key in _SECTIONS if key in document},
+            },
         )
-        self._check_outermost(root, manifest)
-        reading = _Reading(
-            origin=origin,
-            chain=(*chain, origin),
-            left_out=substituted.left_out,
-        )
-        return self._contents(reading, root, manifest, shared=shared)
+        outer = self._outermost
+        if outer is None:
+            self._outermost = declared
+            return
+        for key in (*_SECTIONS, "policy", "modes"):
+            if key in document and getattr(declared, key) != getattr(outer, key):
+                message = f"cannot use the {key} of an included manifest; the including one's holds"
+                at = document.key_at((key,))
+                self.found.append(note("manifest.include-ignored", at, message))
 
     def _substituted(
         self,
         document: Document,
         origin: include.Origin,
         given: Mapping[str, str],
-        entry: Cursor | None,
+        entry: Document | None,
     ) -> Substituted:
         surroundings = Surroundings(
             environment=self._environment,
@@ -455,78 +345,115 @@ class _Loading:
         return found
 
     def _contents(
-        self,
-        reading: _Reading,
-        root: Cursor,
-        manifest: Manifest,
-        *,
-        shared: Shared,
-    ) -> Manifest:
-        """Give the nodes of a document or group what they share, and add groups and includes."""
-        shared = shared.inner(root, self.found)
-        manifest = replace(
-            manifest,
-            nodes=tuple(shared.given_to(node) for node in manifest.nodes),
-            left_out=tuple(
-                str(place[-1])
-                for place in reading.left_out
-                if place[:-1] == (*root.document.place, "nodes")
-            ),
-        )
+        self, reading: _Reading, root: Document, around: Shared, entry: Document | None
+    ) -> None:
+        """Add what a document or group has.
+
+        Args:
+            reading: the file.
+            root: the document or group.
+            around: what is around it gives its nodes.
+            entry: the group or the include that it came by.
+        """
+        shared = around.inner(root, self.found)
+        for key, part in root.entries("nodes"):
+            node = build_node(
+                key,
+                part,
+                base=reading.chain[-1].path.parent,
+                shared=shared,
+                environment=self._environment,
+                found=self.found,
+            )
+            first = self._nodes.setdefault(node.key, node)
+            if first is not node and entry is not None:
+                what = "include" if "manifest" in entry else "group"
+                message = (
+                    f"cannot include the node {quote(node.key)}: {first.at.spelled} declares it too"
+                )
+                hint = f"give the {what} a prefix"
+                self.found.append(error("manifest.duplicate-node", entry.at(), message, hint))
+            if node.machine == THIS_HOST:
+                self._machines.setdefault(THIS_HOST, Machine(name=THIS_HOST, at=node.at))
+        left_out = [
+            str(place[-1]) for place in reading.left_out if place[:-1] == (*root.place, "nodes")
+        ]
         for each in root.items("include"):
-            if reading.leaves_out(each):
-                key = each.text("prefix")
-                here = (f"{key}/",) if key and "$(" not in key else ()
-                manifest = replace(manifest, left_out=(*manifest.left_out, *here))
-            else:
-                manifest = self._include(manifest, each, reading.chain, shared)
+            if each.place not in reading.left_out:
+                self._include(reading, each, shared)
+            elif (prefix := each.text("prefix")) and "$(" not in prefix:
+                left_out.append(f"{prefix}/")
         for each in root.items("groups"):
-            if reading.leaves_out(each):
-                keys = tuple(_keys_of(each.value))
-                manifest = replace(manifest, left_out=(*manifest.left_out, *keys))
+            if each.place not in reading.left_out:
+                self._contents(reading, each, shared, each)
             else:
-                manifest = self._group(reading, manifest, each, shared)
-        return manifest
+                left_out += _keys_of(each.root)
+        self._left_out += map(shared.key, left_out)
 
-    def _group(self, reading: _Reading, outer: Manifest, entry: Cursor, shared: Shared) -> Manifest:
-        place = (*entry.document.place, *entry.place)
-        root = Cursor.root(Document(file=entry.document.file, root=entry.value, place=place))
-        inner = build_manifest(
-            root,
-            path=outer.path,
-            arguments=(),
-            base=reading.origin.path.parent,
-            environment=self._environment,
-            found=self.found,
-            machine=shared.machine,
-        )
-        inner = self._contents(reading, root, inner, shared=shared)
-        return self._joined(outer, inner, entry, "group")
+    def _machine(self, name: str, part: Document) -> None:
+        address = canonical(part.text("address"))
+        if address and parse_address(address) is None:
+            message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
+            hint = "look the name up: a plan must not depend on a name server"
+            self.found.append(error("manifest.address", part.at(("address",)), message, hint))
+        machine = Machine(name=name, address=address, at=part.key_at())
+        first = self._machines.setdefault(name, machine)
+        if first.address != address:
+            message = (
+                f"cannot give machine {quote(name)} the address {quote(address)}: "
+                f"it has {quote(first.address)} at {first.at.spelled}"
+            )
+            self.found.append(
+                error("manifest.machine", machine.at, message, "rename one of the two")
+            )
 
-    def _joined(self, outer: Manifest, inner: Manifest, entry: Cursor, what: str) -> Manifest:
-        prefix, namespace = entry.text("prefix"), entry.text("namespace")
-        inner = include.move(inner, prefix=prefix, namespace=namespace)
-        return include.join(outer, inner, entry.at, self.found, what=what)
-
-    def _include(
-        self,
-        outer: Manifest,
-        entry: Cursor,
-        chain: tuple[include.Origin, ...],
-        shared: Shared,
-    ) -> Manifest:
-        origin = include.locate(entry, chain, self.found)
+    def _include(self, reading: _Reading, entry: Document, shared: Shared) -> None:
+        origin = include.locate(entry, reading.chain, self.found)
         if origin is None:
-            return outer
+            return
         self._documents += 1
         if self._documents > include.MAX_DOCUMENTS:
             if self._documents == include.MAX_DOCUMENTS + 1:
                 message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
-                self.found.append(error("manifest.include", entry.at, message))
-            return outer
-        given = {name: each.value.text for name, each in entry.entries("arguments")}
-        inner = self.read(origin, given, chain, entry=entry, shared=shared)
-        return outer if inner is None else self._joined(outer, inner, entry, "include")
+                self.found.append(error("manifest.include", entry.at(), message))
+            return
+        given = {name: each.root.text for name, each in entry.entries("arguments")}
+        inner = shared.inner(entry, self.found)
+        self.read(origin, given, chain=reading.chain, entry=entry, around=inner)
+
+    def _link(self, part: Document, around: Shared) -> Link:
+        """Build a link of a document; its topic moves with the document's namespace."""
+        keys = read_part(part, LinkKeys)
+        ends = (
+            (around.key(keys.from_node), EndpointKind.PUBLISHER),
+            (around.key(keys.to_node), EndpointKind.SUBSCRIPTION),
+        )
+        return build(
+            Link,
+            keys,
+            topic=self._moved(keys.topic, ends, around.namespace),
+            from_node=ends[0][0],
+            to_node=ends[1][0],
+            quantities=tuple(quantities(part, keys)),
+            at=part.at(),
+        )
+
+    def _moved(self, topic: str, ends: Iterable[tuple[str, EndpointKind]], namespace: str) -> str:
+        """Return what a topic is called in the system that its document is included in.
+
+        Names of nodes move with their namespace, and so do relative topic names; an absolute topic
+        name stays where it is. A link's topic moves with its publisher.
+        """
+        for key, kind in ends:
+            node = self._nodes.get(key)
+            if node is None or not namespace:
+                continue
+            alone = f"/{node.namespace.removeprefix(f'/{namespace}').lstrip('/')}"
+            before = replace(node, namespace=alone)
+            for each in node.interface.endpoints:
+                if each.kind is kind and topic_of(before, each.name, kind) == topic:
+                    return topic_of(node, each.name, kind) or topic
+        return topic
 
     def _check_suffix(self, document: Document) -> None:
         if not document.file.endswith(SUFFIX):
@@ -537,27 +464,14 @@ class _Loading:
             hint = f"rename it to {stem}{SUFFIX}"
             self.found.append(note("manifest.suffix", at, message, hint))
 
-    def _check_outermost(self, root: Cursor, manifest: Manifest) -> None:
-        """Warn where a system-wide section of an included manifest has no effect."""
-        if self._outermost is None:
-            self._outermost = manifest
-            return
-        outer = self._outermost
-        for key in (*_SECTIONS, "policy", "modes"):
-            if key in root and getattr(manifest, key) != getattr(outer, key):
-                message = f"cannot use the {key} of an included manifest; the including one's holds"
-                at = root.document.key_at((key,))
-                self.found.append(note("manifest.include-ignored", at, message))
 
-
-def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
+def _misspelt(document: Document, place: Place) -> tuple[Diagnostic, ...]:
     """Return what is wrong with something that is left out, whatever its substitutions become."""
-    value = document.find(place)
-    if value is None:
-        return []
-    part = Document(file=document.file, root=value, place=place)
+    part = document.get(*place)
+    if part is None:
+        return ()
     kind = str(place[-2]).removesuffix("s").capitalize()
-    return [each for _, each in validate(part, definition=kind, is_resolved=False)]
+    return validate(part, definition=kind, is_resolved=False)
 
 
 def _keys_of(group: Value) -> Iterator[str]:

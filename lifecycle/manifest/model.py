@@ -700,8 +700,7 @@ class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
             'max_delay_ms', 'loss' and 'rate_hz' and says why.
         max_delay_ms: Longest delay from publication to the start of the callback, milliseconds;
             that of the links of its topic if left out.
-        max_message_size: Largest serialized message, bytes; the bound of its type, where all its
-            fields have one, if left out.
+        max_message_size: Largest serialized message, bytes.
         non_blocking_send: Never wait for room in the socket's buffer: what finds it full is lost,
             and only a RELIABLE publisher sends it again.
     """

@@ -24,7 +24,7 @@ from lifecycle.manifest.interface import build_inline
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
 from lifecycle.manifest.qos import POLICIES
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
+from lifecycle.manifest.yaml.document import Document, Value, error, warning
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import quote
 
@@ -34,118 +34,6 @@ _NOT_OURS = ("nodl_version", "description", "codegen", "include")
 _UNCHECKED = ("additional_constraints", "validation")
 _PARAMETER_KEYS = ("type", "default_value", "description", "read_only")
 _FIXED_SIZE = re.compile(r"(string|int_array|double_array|string_array)_fixed_[1-9][0-9]*")
-
-_Entries = dict[str, Value]
-
-
-class _Reader:
-    """Reads one document, its includes left out.
-
-    Attributes:
-        interface: empty after an error.
-        found: errors and warnings, each at its place.
-    """
-
-    def __init__(self, document: Document) -> None:
-        self._document = document
-        self.interface = Interface()
-        self.found: list[Diagnostic] = []
-        root = document.root
-        entries = self._entries((), root, [*_NOT_OURS, "parameters", *map(_key, EndpointKind)])
-        version = entries.get("nodl_version")
-        if version is None:
-            self._error((), "cannot do without the key 'nodl_version'", "add 'nodl_version: 2'")
-        elif version.data != NODL_VERSION:
-            message = f"cannot use nodl_version {quote(version.data)}; allowed: {NODL_VERSION}"
-            self._error(("nodl_version",), message)
-        for key in _NOT_OURS:
-            entries.pop(key, None)
-        for kind in EndpointKind:
-            if (each := entries.get(kind.value)) and isinstance(each.data, tuple):
-                items = enumerate(each.data)
-                data = tuple(self._endpoint(kind, (kind.value, i), item) for i, item in items)
-                entries[kind.value] = replace(each, data=data)
-        if (each := entries.get("parameters")) and isinstance(each.data, Mapping):
-            parameters = {
-                name: self._parameter(name, ("parameters", name), value)
-                for name, value in each.data.items()
-            }
-            known = {name: value for name, value in parameters.items() if value is not None}
-            entries["parameters"] = replace(each, data=known)
-        inline = replace(document, root=replace(root, data=entries))
-        found = [each for _, each in validate(inline, definition="Interface")]
-        if not found:
-            self.interface = build_inline(Cursor.root(inline), found)
-        rules = {"manifest.duplicate-name": "nodl.duplicate"}
-        self.found += [replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found]
-        if any(each.severity is Severity.ERROR for each in self.found):
-            self.interface = Interface()
-
-    def _endpoint(self, kind: EndpointKind, place: Place, value: Value) -> Value:
-        if not isinstance(value.data, Mapping):
-            return value
-        known = ("name", "type", "description", *(() if kind.is_action else ("qos",)))
-        entries = self._entries(place, value, known)
-        if (type_ := entries.get("type")) and type_.text.count("/") == 1:
-            word = "msg" if kind.is_topic else "action" if kind.is_action else "srv"
-            entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
-        if kind.is_topic and "qos" not in entries:
-            self._error(place, f"cannot do without the key 'qos' in a {kind.noun}")
-        qos, at = entries.get("qos"), (*place, "qos")
-        if qos and not isinstance(qos.data, Mapping):
-            self._error(at, f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping")
-        elif qos and isinstance(qos.data, Mapping):
-            entries["qos"] = replace(qos, data=self._entries(at, qos, POLICIES))
-            for name in ("history", "reliability"):
-                if name not in qos.data:
-                    self._error(at, f"cannot do without the key {name!r} in a QoS profile")
-            history = qos.data.get("history")
-            if history and history.data == "KEEP_LAST" and "depth" not in qos.data:
-                self._error(at, "cannot do without 'depth' under KEEP_LAST", "add 'depth: 10'")
-        return replace(value, data=entries)
-
-    def _parameter(self, name: str, place: Place, value: Value) -> Value | None:
-        """Return a declaration as a manifest has it; None for what declares no parameter."""
-        if not isinstance(value.data, Mapping):
-            return value
-        entries = self._entries(place, value, (*_PARAMETER_KEYS, *_UNCHECKED))
-        type_ = entries.get("type")
-        if type_ and (fixed := _FIXED_SIZE.fullmatch(type_.text)):
-            self._unchecked((*place, "type"), f"the size in type {type_.text!r}")
-            entries["type"] = _text(type_, fixed[1])
-        for key in _UNCHECKED:
-            if (unchecked := entries.pop(key, None)) and unchecked.data is not None:
-                self._unchecked((*place, key), f"{key!r}")
-        if name.startswith("__map_") or ".__map_" in name:
-            self._unchecked(place, f"the parameter map {name!r}")
-            return None
-        if type_ and type_.text == "none":
-            return None
-        return replace(value, data=entries)
-
-    def _entries(self, place: Place, value: Value, known: Iterable[str]) -> _Entries:
-        """Return the entries of a mapping that NoDL knows, and warn of the others."""
-        assert isinstance(value.data, Mapping)
-        words = list(known)
-        for key in value.data:
-            if key not in words:
-                at = self._document.key_at((*place, key))
-                message = f"cannot use the key {key!r}: NoDL {NODL_VERSION} has none; it is ignored"
-                self.found.append(
-                    warning("nodl.unknown-key", at, message, did_you_mean(key, words))
-                )
-        return {key: each for key, each in value.data.items() if key in words}
-
-    def _unchecked(self, place: Place, what: str) -> None:
-        message = f"cannot check {what}; parameters are checked by type only"
-        self.found.append(warning("nodl.unchecked", self._document.at(place), message))
-
-    def _error(self, place: Place, message: str, hint: str = "") -> None:
-        self.found.append(error("nodl.invalid", self._document.at(place), message, hint))
-
-
-def _key(kind: EndpointKind) -> str:
-    return kind.value
 
 
 def _text(value: Value, text: str) -> Value:
@@ -221,22 +109,112 @@ class _NodlReading:
         except ManifestError as problem:
             self.found += problem.diagnostics
             return
-        reader = _Reader(document)
-        self.found += reader.found
-        self.endpoints += reader.interface.endpoints
-        self.parameters += reader.interface.parameters
-        includes = document.find(("include",))
-        listed = includes.data if includes else ()
-        if not isinstance(listed, tuple):
-            self._error("invalid", document.at(("include",)), "cannot include what is no list")
+        interface = self._interface(document)
+        self.endpoints += interface.endpoints
+        self.parameters += interface.parameters
+        includes = document.get("include")
+        if includes is not None and not isinstance(includes.root.data, tuple):
+            self._error("invalid", includes.at(), "cannot include what is no list")
             return
-        for index in range(len(listed)):
-            where = document.at(("include", index, "ref"))
-            ref = document.find(("include", index, "ref"))
-            if ref is not None and isinstance(ref.data, str) and ref.data:
-                self.follow(ref.data, path.parent, where, (*chain, identity))
+        for each in document.items("include"):
+            if ref := each.text("ref"):
+                self.follow(ref, path.parent, each.at(("ref",)), (*chain, identity))
             else:
+                where = each.at(("ref",))
                 self._error("invalid", where, "cannot do without the key 'ref' in an include")
+
+    def _interface(self, document: Document) -> Interface:
+        """Return what a document declares, its includes left out; nothing after an error."""
+        before = len(self.found)
+        lists = [kind.value for kind in EndpointKind]
+        entries = self._known(document, [*_NOT_OURS, "parameters", *lists])
+        version = entries.get("nodl_version")
+        if version is None:
+            message = "cannot do without the key 'nodl_version'"
+            self._error("invalid", document.at(), message, "add 'nodl_version: 2'")
+        elif version.data != NODL_VERSION:
+            message = f"cannot use nodl_version {quote(version.data)}; allowed: {NODL_VERSION}"
+            self._error("invalid", document.at(("nodl_version",)), message)
+        for key in _NOT_OURS:
+            entries.pop(key, None)
+        for kind in EndpointKind:
+            if (each := entries.get(kind.value)) and isinstance(each.data, tuple):
+                data = tuple(self._endpoint(kind, part) for part in document.items(kind.value))
+                entries[kind.value] = replace(each, data=data)
+        if (each := entries.get("parameters")) and isinstance(each.data, dict):
+            declared = {
+                name: self._parameter(name, part) for name, part in document.entries("parameters")
+            }
+            known = {name: value for name, value in declared.items() if value is not None}
+            entries["parameters"] = replace(each, data=known)
+        inline = replace(document, root=replace(document.root, data=entries))
+        found = list(validate(inline, definition="Interface"))
+        interface = Interface() if found else build_inline(inline, found)
+        rules = {"manifest.duplicate-name": "nodl.duplicate"}
+        self.found += [replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found]
+        failed = any(each.severity is Severity.ERROR for each in self.found[before:])
+        return Interface() if failed else interface
+
+    def _endpoint(self, kind: EndpointKind, part: Document) -> Value:
+        """Return an endpoint as a manifest has it."""
+        if not isinstance(part.root.data, dict):
+            return part.root
+        known = ("name", "type", "description", *(() if kind.is_action else ("qos",)))
+        entries = self._known(part, known)
+        if (type_ := entries.get("type")) and type_.text.count("/") == 1:
+            word = "msg" if kind.is_topic else "action" if kind.is_action else "srv"
+            entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
+        if kind.is_topic and "qos" not in entries:
+            self._error("invalid", part.at(), f"cannot do without the key 'qos' in a {kind.noun}")
+        qos = part.get("qos") if "qos" in entries else None
+        if qos is not None and isinstance(qos.root.data, dict):
+            entries["qos"] = replace(qos.root, data=self._known(qos, POLICIES))
+            for name in ("history", "reliability"):
+                if name not in qos:
+                    message = f"cannot do without the key {name!r} in a QoS profile"
+                    self._error("invalid", qos.at(), message)
+            if qos.text("history") == "KEEP_LAST" and "depth" not in qos:
+                message = "cannot do without 'depth' under KEEP_LAST"
+                self._error("invalid", qos.at(), message, "add 'depth: 10'")
+        elif qos is not None:
+            message = f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping"
+            self._error("invalid", qos.at(), message)
+        return replace(part.root, data=entries)
+
+    def _parameter(self, name: str, part: Document) -> Value | None:
+        """Return a declaration as a manifest has it; None for what declares no parameter."""
+        if not isinstance(part.root.data, dict):
+            return part.root
+        entries = self._known(part, (*_PARAMETER_KEYS, *_UNCHECKED))
+        type_ = entries.get("type")
+        if type_ and (fixed := _FIXED_SIZE.fullmatch(type_.text)):
+            self._unchecked(part.at(("type",)), f"the size in type {type_.text!r}")
+            entries["type"] = _text(type_, fixed[1])
+        for key in _UNCHECKED:
+            if (unchecked := entries.pop(key, None)) and unchecked.data is not None:
+                self._unchecked(part.at((key,)), f"{key!r}")
+        if name.startswith("__map_") or ".__map_" in name:
+            self._unchecked(part.at(), f"the parameter map {name!r}")
+            return None
+        if type_ and type_.text == "none":
+            return None
+        return replace(part.root, data=entries)
+
+    def _known(self, part: Document, words: Iterable[str]) -> dict[str, Value]:
+        """Return the entries of a mapping that NoDL knows, and warn of the others."""
+        known, found = list(words), {}
+        for key, each in part.entries():
+            if key in known:
+                found[key] = each.root
+                continue
+            message = f"cannot use the key {key!r}: NoDL {NODL_VERSION} has none; it is ignored"
+            hint = did_you_mean(key, known)
+            self.found.append(warning("nodl.unknown-key", each.key_at(), message, hint))
+        return found
+
+    def _unchecked(self, at: Position, what: str) -> None:
+        message = f"cannot check {what}; parameters are checked by type only"
+        self.found.append(warning("nodl.unchecked", at, message))
 
     def report_collisions(self) -> None:
         """Refuse a name that two entries of one list declare (nodl.schema.yaml, `include`)."""

@@ -1,10 +1,10 @@
 """Validate a document against its JSON Schema, with diagnostics that people can act on.
 
-Owns: loading the shipped schemas; turning each violation into one `Diagnostic`, for the branch that
-was meant where a choice failed; the wording: what is allowed, derived from a schema's keywords, and
-the nearest spelling. Every message starts with "cannot" and quotes the value. Also the adapter
-around jsonschema's `ValidationError`, whose fields are untyped and optional; and the quick look by
-which a document that fits needs no jsonschema. Pure but for reading the shipped schemas.
+Owns: loading the shipped schemas; turning each error of jsonschema into diagnostics, for the branch
+that was meant where a choice failed; the wording: what is allowed, derived from a schema's
+keywords, and the nearest spelling. Every message starts with "cannot" and quotes the value. Also
+the quick look by which a document that fits needs no jsonschema. Pure but for reading the shipped
+schemas.
 """
 
 from __future__ import annotations
@@ -33,218 +33,7 @@ if TYPE_CHECKING:  # it costs 60 ms, and who only asks for a similar name needs 
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
 
-
-class Violation(msgspec.Struct, frozen=True, kw_only=True):
-    """A value that breaks one keyword.
-
-    Attributes:
-        keyword: the broken keyword, `enum`.
-        operand: what the schema has for that keyword.
-        schema: the subschema that holds the keyword.
-        value: the offending value.
-        place: path of that value.
-        is_key: the value is a key of the mapping at `place`.
-        name: the key, known to the schema, of the value; empty where the user
-            chooses keys, and in lists.
-        branches: for `anyOf` and `oneOf`, what each branch has against the value.
-    """
-
-    keyword: str
-    operand: Any
-    schema: Mapping[str, Any]
-    value: Any
-    place: Place
-    is_key: bool
-    name: str = ""
-    branches: tuple[tuple[Violation, ...], ...] = ()
-
-    @property
-    def is_way(self) -> bool:
-        """A choice between ways to fill a mapping, each a list of required keys."""
-        return self.keyword in {"anyOf", "oneOf"} and all("required" in x for x in self.operand)
-
-
-def violations(errors: Iterable[ValidationError]) -> Iterator[Violation]:
-    """Type each error; a failed choice becomes the violations of the branch that was meant."""
-    for each in errors:
-        violation = _typed(each)
-        meant = _meant(violation)
-        if meant is None:
-            yield violation
-        else:
-            yield from meant
-
-
-def _typed(each: ValidationError) -> Violation:
-    groups: dict[Any, list[ValidationError]] = {}
-    for inner in each.context or ():
-        groups.setdefault(inner.relative_schema_path[0], []).append(inner)
-    schema = each.schema
-    return Violation(
-        keyword=str(each.validator),
-        operand=each.validator_value,
-        schema=schema if isinstance(schema, Mapping) else {},
-        value=each.instance,
-        place=tuple(each.absolute_path),
-        is_key="propertyNames" in each.absolute_schema_path,
-        name=_name(each),
-        branches=tuple(tuple(violations(group)) for group in groups.values()),
-    )
-
-
-def _name(each: ValidationError) -> str:
-    if not each.absolute_path:
-        return ""
-    last, path = each.absolute_path[-1], list(each.absolute_schema_path)
-    known = any(pair == ("properties", last) for pair in itertools.pairwise(path))
-    return last if known and isinstance(last, str) else ""
-
-
-def _meant(choice: Violation) -> tuple[Violation, ...] | None:
-    """Return what the one branch violates whose type fits the value; None if no single one fits."""
-    fitting = [
-        branch
-        for branch in choice.branches
-        if not any(
-            each.keyword in {"type", "required", "not"} and each.place == choice.place
-            for each in branch
-        )
-    ]
-    return fitting[0] if len(fitting) == 1 else None
-
-
-_TYPES = {
-    "string": "a string",
-    "integer": "an integer",
-    "number": "a number",
-    "boolean": "true or false",
-    "array": "a list",
-    "object": "a mapping",
-    "null": "null",
-}
-
-
-def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:
-    """Return message and hint for a key that the schema does not know."""
-    words = list(known)
-    if key in _GONE:
-        why, hint = _GONE[key]
-        return f"cannot use {quote(key)} any more: {why}", hint
-    message = f"cannot use the unknown key {quote(key)}"
-    near = did_you_mean(key, words)
-    return (message, near) if near else (f"{message}; allowed: {', '.join(words)}", "")
-
-
-def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
-    """Return message and hint for a key that must be there."""
-    example = (schema.get("examples") or [schema.get("const", "…")])[0]
-    return f"cannot do without the key {key!r}", f"add '{key}: {example}'"
-
-
-_GONE = {
-    "on_supervisor_lost": (
-        "nodes whose supervisor is gone are deactivated, and their process ends",
-        "remove it",
-    ),
-    "on_violation": ("a link has none", "write it at one of its nodes, or for the system"),
-}
-"""Keys of earlier versions: what holds without them, and what to do."""
-
-
-def bad_key(each: Violation) -> tuple[str, str]:
-    """Return message and hint for a key whose spelling is not allowed."""
-    meant = _closest(each.value, each.operand) if each.keyword == "enum" else ""
-    return f"cannot use {quote(each.value)} as a key here", meant or _pattern(each.schema)
-
-
-def bad_value(each: Violation) -> tuple[str, str]:
-    """Return message and hint for a value that breaks one keyword of its schema."""
-    if each.is_way:
-        return _way(each)
-    name = each.name
-    if each.keyword in {"minItems", "minProperties", "minLength"}:
-        return f"cannot leave {name or 'this'} empty", ""
-    subject = (
-        f"cannot use {name} {quote(each.value)}" if name else f"cannot use {quote(each.value)}"
-    )
-    if isinstance(each.value, (list, dict)) and name:
-        subject = f"cannot use {quote(each.value)} as {name}"
-    allowed, hint = _allowed(each)
-    return f"{subject}; {allowed}" if allowed else subject, hint
-
-
-def _allowed(each: Violation) -> tuple[str, str]:
-    """Return what the broken keyword allows, and a hint."""
-    if each.keyword in {"oneOf", "anyOf"}:
-        own = [inner for branch in each.branches for inner in branch if inner.place == each.place]
-        types = [
-            name for inner in own if inner.keyword == "type" for name in _listed(inner.operand)
-        ]
-        return _types(each.value, types)
-    if each.keyword == "type":
-        return _types(each.value, _listed(each.operand))
-    if each.keyword in {"enum", "const"}:
-        allowed = [each.operand] if each.keyword == "const" else each.operand
-        return f"allowed: {_spell(allowed)}", _closest(each.value, allowed)
-    if each.keyword == "pattern":
-        return "", _pattern(each.schema)
-    return f"allowed: {_range(each.schema)}", ""
-
-
-def _way(each: Violation) -> tuple[str, str]:
-    """Describe a failed choice between ways to fill a mapping."""
-    ways: list[list[str]] = [branch["required"] for branch in each.operand]
-    given = [key for key in each.value if any(key in way for way in ways)]
-    only = "exactly one" if each.keyword == "oneOf" else "at least one"
-    spelled = ", ".join(" with ".join(way) for way in ways)
-    whole = [way for way in ways if all(key in given for key in way)]
-    if not whole and given:
-        missing = next(key for way in ways if given[0] in way for key in way if key not in given)
-        return f"cannot use {given[0]} without {missing}", f"add '{missing}: …'"
-    if given:
-        words = f"{', '.join(given[:-1])} and {given[-1]}"
-        return f"cannot use {words} together", f"give {only} of {spelled}"
-    return f"cannot do without any of {spelled}", f"give {only} of them"
-
-
-def _types(value: object, types: list[str]) -> tuple[str, str]:
-    """Return which types are allowed, and how to get there from `value`."""
-    words = [_TYPES[each] for each in types if not (each == "integer" and "number" in types)]
-    words = list(dict.fromkeys(words))
-    joined = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-    hint = ""
-    if types == ["boolean"] and isinstance(value, str) and value in YAML_1_1_BOOLEANS:
-        hint = "YAML 1.2 has no other words for them"
-    elif isinstance(value, str) and has_leading_zero(value) and {"integer", "number"} & {*types}:
-        hint = "write it without the leading 0, which versions of YAML read differently"
-    elif types == ["string"] and isinstance(value, (bool, int, float)):
-        hint = "put it in quotes"
-    return f"it must be {joined}", hint
-
-
-def _range(schema: Mapping[str, Any]) -> str:
-    low, above, high = (schema.get(k) for k in ("minimum", "exclusiveMinimum", "maximum"))
-    below = schema.get("exclusiveMaximum")
-    lower = f"more than {above}" if above is not None else f"{low}"
-    upper = f"less than {below}" if below is not None else f"at most {high}"
-    return f"{lower}, {upper}" if above is not None else f"{lower} to {high}"
-
-
-def _closest(value: object, allowed: list[object]) -> str:
-    words = [each for each in allowed if isinstance(each, str)]
-    return did_you_mean(value, words) if isinstance(value, str) else ""
-
-
-def _pattern(schema: Mapping[str, Any]) -> str:
-    return str(schema.get("patternErrorMessage") or f"it must match {schema.get('pattern')}")
-
-
-def _spell(values: Iterable[object]) -> str:
-    return ", ".join(each if isinstance(each, str) else quote(each) for each in values)
-
-
-def _listed(types: str | list[str]) -> list[str]:
-    return [types] if isinstance(types, str) else types
+_CHOICES = ("anyOf", "oneOf")
 
 
 MANIFEST = "manifest.v1.schema.json"
@@ -269,7 +58,7 @@ def validate(
     definition: str = "",
     ignore: Collection[Place] = (),
     is_resolved: bool = True,
-) -> tuple[tuple[Place, Diagnostic], ...]:
+) -> tuple[Diagnostic, ...]:
     """Check a document.
 
     Args:
@@ -279,32 +68,27 @@ def validate(
         is_resolved: its substitutions are; of one that is left out they never will be.
 
     Returns:
-        Every violation and the value it is about, at most `MAX_FINDINGS`, in no particular order.
+        Every violation, at most `MAX_FINDINGS`, in no particular order.
     """
-    found: list[tuple[Place, Diagnostic]] = []
-    seen: set[tuple[Place, str]] = set()
     type_ = getattr(written, definition or "Manifest")
     if is_resolved and not ignore and _fits(document, type_):
         return ()
-    plain = document.root.plain()
-    errors = validator(definition, is_resolved).iter_errors(plain)
-    broken = list(violations(errors))
-    enums = {each.place for each in broken if each.keyword == "enum"}
-    # The allowed values are more precise than that they are strings.
-    broken = [each for each in broken if not (each.keyword == "type" and each.place in enums)]
-    # `required` holds for everything that is no mapping, so that several ways seem to be taken.
-    broken = [each for each in broken if isinstance(each.value, dict) or not each.is_way]
-    for place, diagnostic in _diagnose(document, broken):
-        if (place, diagnostic.message) in seen or _inside(place, ignore):
-            continue
-        if len(found) == MAX_FINDINGS:
-            message = f"cannot list more than {MAX_FINDINGS} findings"
-            found.append(
-                ((), error("manifest.too-many", document.at(), message, "fix these first"))
-            )
-            break
-        seen.add((place, diagnostic.message))
-        found.append((place, diagnostic))
+    errors = list(_meant(validator(definition, is_resolved).iter_errors(document.plain())))
+    enums = {_place(each) for each in errors if each.validator == "enum"}
+    found: dict[Diagnostic, None] = {}
+    for each in errors:
+        if each.validator == "type" and _place(each) in enums:
+            continue  # the allowed values are more precise than that they are strings
+        if _is_way(each) and not isinstance(each.instance, dict):
+            continue  # `required` holds for what is no mapping: several ways seem to be taken
+        for place, diagnostic in _diagnose(document, each):
+            if diagnostic in found or any(place[: len(known)] == known for known in ignore):
+                continue
+            if len(found) == MAX_FINDINGS:
+                message = f"cannot list more than {MAX_FINDINGS} findings"
+                many = error("manifest.too-many", document.at(), message, "fix these first")
+                return (*found, many)
+            found[diagnostic] = None
     return tuple(found)
 
 
@@ -361,51 +145,218 @@ def _resolved_only(schema: object) -> object:
     return result
 
 
-def _inside(place: Place, places: Collection[Place]) -> bool:
-    return any(place[: len(each)] == each for each in places)
+def _meant(errors: Iterable[ValidationError]) -> Iterator[ValidationError]:
+    """Yield each error; of a failed choice those of the one branch whose type fits the value."""
+    for choice in errors:
+        branches: dict[object, list[ValidationError]] = {}
+        for each in choice.context or ():
+            branches.setdefault(each.relative_schema_path[0], []).append(each)
+        resolved = [list(_meant(each)) for each in branches.values()]
+        fitting = [branch for branch in resolved if not any(_is_unlike(choice, x) for x in branch)]
+        yield from fitting[0] if len(fitting) == 1 else [choice]
 
 
-def _diagnose(document: Document, found: Iterable[Violation]) -> Iterator[tuple[Place, Diagnostic]]:
-    for each in found:
-        place = each.place
-        if each.keyword == "additionalProperties":
-            yield from _unknown_keys(document, each)
-        elif each.keyword == "required":
-            yield from _missing_keys(document, each)
-        elif each.is_key:
-            place = (*place, str(each.value))
-            message, hint = bad_key(each)
-            yield place, error("manifest.key", document.key_at(place), message, hint)
-        elif not (
-            each.is_way and _misspelt(each) & {k for x in each.operand for k in x["required"]}
-        ):
-            rule = _RULES.get(each.keyword, "value")
-            message, hint = bad_value(each)
-            yield place, error(f"manifest.{rule}", document.at(place), message, hint)
+def _is_unlike(choice: ValidationError, each: ValidationError) -> bool:
+    """Whether an error says that the branch of a choice is for values of another kind."""
+    return each.validator in ("type", "required", "not") and _place(each) == _place(choice)
+
+
+def _place(each: ValidationError) -> Place:
+    return tuple(each.absolute_path)
+
+
+def _operand(each: ValidationError) -> Any:
+    """Return what the schema has for the broken keyword."""
+    return each.validator_value
+
+
+def _subschema(each: ValidationError) -> Mapping[str, Any]:
+    """Return what of the schema holds the broken keyword."""
+    assert isinstance(each.schema, Mapping)
+    return each.schema
+
+
+def _mapping(each: ValidationError) -> Mapping[str, Any]:
+    """Return the mapping whose keys are wrong."""
+    assert isinstance(each.instance, Mapping)
+    return each.instance
+
+
+def _is_way(each: ValidationError) -> bool:
+    """Whether it is a choice between ways to fill a mapping, each a list of required keys."""
+    return each.validator in _CHOICES and all("required" in x for x in _operand(each))
+
+
+def _diagnose(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
+    """Yield what an error says, and the place of the value that each finding is about."""
+    place = _place(each)
+    if each.validator == "additionalProperties":
+        yield from _unknown_keys(document, each)
+    elif each.validator == "required":
+        yield from _missing_keys(document, each)
+    elif "propertyNames" in each.absolute_schema_path:
+        place = (*place, str(each.instance))
+        meant = _closest(each.instance, _operand(each)) if each.validator == "enum" else ""
+        message, hint = f"cannot use {quote(each.instance)} as a key here", meant or _pattern(each)
+        yield place, error("manifest.key", document.key_at(place), message, hint)
+    elif not _is_way(each):
+        rule = _RULES.get(str(each.validator), "value")
+        yield place, error(f"manifest.{rule}", document.at(place), *_value(each))
+    elif not _misspelt(each) & {key for way in _operand(each) for key in way["required"]}:
+        yield place, error("manifest.choice", document.at(place), *_way(each))
 
 
 _RULES = {"type": "type", "oneOf": "choice", "anyOf": "choice", "pattern": "pattern"}
 
-
-def _unknown_keys(document: Document, each: Violation) -> Iterator[tuple[Place, Diagnostic]]:
-    known = list(each.schema["properties"])
-    for key in each.value:
-        if key not in known:
-            place = (*each.place, key)
-            message, hint = unknown_key(key, known)
-            yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
-
-
-def _missing_keys(document: Document, each: Violation) -> Iterator[tuple[Place, Diagnostic]]:
-    known = each.schema.get("properties", {})
-    for key in each.operand:
-        if key not in each.value and key not in _misspelt(each):
-            message, hint = missing_key(key, known.get(key, {}))
-            at = document.key_at(each.place)
-            yield (*each.place, key), error("manifest.missing-key", at, message, hint)
+_GONE = {
+    "on_supervisor_lost": (
+        "nodes whose supervisor is gone are deactivated, and their process ends",
+        "remove it",
+    ),
+    "on_violation": ("a link has none", "write it at one of its nodes, or for the system"),
+}
+"""Keys of earlier versions: what holds without them, and what to do."""
 
 
-def _misspelt(each: Violation) -> set[str]:
+def _known(each: ValidationError) -> Mapping[str, Any]:
+    """Return the keys that the mapping of an error may have, and their schemas."""
+    known: Mapping[str, Any] = _subschema(each).get("properties", {})
+    return known
+
+
+def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
+    known = _known(each)
+    for key in _mapping(each):
+        if key in known:
+            continue
+        message, hint = f"cannot use the unknown key {quote(key)}", did_you_mean(key, known)
+        if key in _GONE:
+            why, hint = _GONE[key]
+            message = f"cannot use {quote(key)} any more: {why}"
+        elif not hint:
+            message = f"{message}; allowed: {', '.join(known)}"
+        place = (*_place(each), key)
+        yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
+
+
+def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
+    place, known = _place(each), _known(each)
+    for key in _operand(each):
+        if key not in _mapping(each) and key not in _misspelt(each):
+            schema = known.get(key, {})
+            example = (schema.get("examples") or [schema.get("const", "…")])[0]
+            message, hint = f"cannot do without the key {key!r}", f"add '{key}: {example}'"
+            at = document.key_at(place)
+            yield (*place, key), error("manifest.missing-key", at, message, hint)
+
+
+def _misspelt(each: ValidationError) -> set[str]:
     """Return the known keys that unknown ones probably mean: the unknown key is finding enough."""
-    known = each.schema.get("properties", {})
-    return {nearest(key, known) for key in each.value if key not in known}
+    known = _known(each)
+    return {nearest(key, known) for key in _mapping(each) if key not in known}
+
+
+def _value(each: ValidationError) -> tuple[str, str]:
+    """Return message and hint for a value that breaks one keyword of its schema."""
+    name, value = _name(each), each.instance
+    if each.validator in {"minItems", "minProperties", "minLength"}:
+        return f"cannot leave {name or 'this'} empty", ""
+    subject = f"cannot use {name} {quote(value)}" if name else f"cannot use {quote(value)}"
+    if isinstance(value, (list, dict)) and name:
+        subject = f"cannot use {quote(value)} as {name}"
+    allowed, hint = _allowed(each)
+    return f"{subject}; {allowed}" if allowed else subject, hint
+
+
+def _name(each: ValidationError) -> str:
+    """Return the key of a value, if the schema knows it; empty where users choose it, in lists."""
+    last = each.absolute_path[-1] if each.absolute_path else ""
+    steps = itertools.pairwise(each.absolute_schema_path)
+    is_known = any(pair == ("properties", last) for pair in steps)
+    return last if is_known and isinstance(last, str) else ""
+
+
+def _allowed(each: ValidationError) -> tuple[str, str]:
+    """Return what the broken keyword allows, and a hint."""
+    if each.validator in _CHOICES:
+        own = (inner for inner in _meant(each.context or ()) if _place(inner) == _place(each))
+        types = [
+            name for inner in own if inner.validator == "type" for name in _listed(_operand(inner))
+        ]
+        return _types(each.instance, types)
+    if each.validator == "type":
+        return _types(each.instance, _listed(_operand(each)))
+    if each.validator in {"enum", "const"}:
+        allowed = [_operand(each)] if each.validator == "const" else _operand(each)
+        return f"allowed: {_spell(allowed)}", _closest(each.instance, allowed)
+    if each.validator == "pattern":
+        return "", _pattern(each)
+    return f"allowed: {_range(_subschema(each))}", ""
+
+
+def _way(each: ValidationError) -> tuple[str, str]:
+    """Describe a failed choice between ways to fill a mapping."""
+    ways: list[list[str]] = [branch["required"] for branch in _operand(each)]
+    given = [key for key in _mapping(each) if any(key in way for way in ways)]
+    only = "exactly one" if each.validator == "oneOf" else "at least one"
+    spelled = ", ".join(" with ".join(way) for way in ways)
+    whole = [way for way in ways if all(key in given for key in way)]
+    if not whole and given:
+        missing = next(key for way in ways if given[0] in way for key in way if key not in given)
+        return f"cannot use {given[0]} without {missing}", f"add '{missing}: …'"
+    if given:
+        words = f"{', '.join(given[:-1])} and {given[-1]}"
+        return f"cannot use {words} together", f"give {only} of {spelled}"
+    return f"cannot do without any of {spelled}", f"give {only} of them"
+
+
+_TYPES = {
+    "string": "a string",
+    "integer": "an integer",
+    "number": "a number",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a mapping",
+    "null": "null",
+}
+
+
+def _types(value: object, types: list[str]) -> tuple[str, str]:
+    """Return which types are allowed, and how to get there from `value`."""
+    words = [_TYPES[each] for each in types if not (each == "integer" and "number" in types)]
+    words = list(dict.fromkeys(words))
+    joined = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    hint = ""
+    if types == ["boolean"] and isinstance(value, str) and value in YAML_1_1_BOOLEANS:
+        hint = "YAML 1.2 has no other words for them"
+    elif isinstance(value, str) and has_leading_zero(value) and {"integer", "number"} & {*types}:
+        hint = "write it without the leading 0, which versions of YAML read differently"
+    elif types == ["string"] and isinstance(value, (bool, int, float)):
+        hint = "put it in quotes"
+    return f"it must be {joined}", hint
+
+
+def _range(schema: Mapping[str, Any]) -> str:
+    low, above, high = (schema.get(k) for k in ("minimum", "exclusiveMinimum", "maximum"))
+    below = schema.get("exclusiveMaximum")
+    lower = f"more than {above}" if above is not None else f"{low}"
+    upper = f"less than {below}" if below is not None else f"at most {high}"
+    return f"{lower}, {upper}" if above is not None else f"{lower} to {high}"
+
+
+def _closest(value: object, allowed: list[object]) -> str:
+    words = [each for each in allowed if isinstance(each, str)]
+    return did_you_mean(value, words) if isinstance(value, str) else ""
+
+
+def _pattern(each: ValidationError) -> str:
+    schema = _subschema(each)
+    return str(schema.get("patternErrorMessage") or f"it must match {schema.get('pattern')}")
+
+
+def _spell(values: Iterable[object]) -> str:
+    return ", ".join(each if isinstance(each, str) else quote(each) for each in values)
+
+
+def _listed(types: str | list[str]) -> list[str]:
+    return [types] if isinstance(types, str) else types

@@ -14,10 +14,9 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.manifest.building import build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import Findings
+from lifecycle.manifest.interface import Findings, build_parameters
 from lifecycle.manifest.model import (
     SIM_TIME,
     SUPERVISION_KEYS,
@@ -28,53 +27,69 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
-from lifecycle.manifest.yaml.document import Cursor, error, warning
+from lifecycle.manifest.written import read
+from lifecycle.manifest.yaml.document import Document, error, warning
+
+
+THIS_HOST = "local"
+"""Name of the machine of nodes that name none; declared implicitly, without address."""
 
 
 class Shared(msgspec.Struct, frozen=True, kw_only=True):
-    """What all nodes of a document or group get that have nothing nearer.
+    """What all nodes of a document or group get from it and from what is around it.
 
     Attributes:
+        prefix: of their keys, `left/arm`; empty for none.
+        namespace: before their own, `left/arm`; empty for none.
         parameters: value and place, by name.
         remap: new name and place, by the name in the node's code.
         machine: where a node runs that names no machine.
         supervision: value and place, by key of `Supervision`.
     """
 
-    machine: str
+    prefix: str = ""
+    namespace: str = ""
+    machine: str = THIS_HOST
     parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
     remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
     supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
 
-    def inner(self, cursor: Cursor, found: Findings) -> Shared:
-        """Return what holds inside a document or group.
+    def inner(self, root: Document, found: Findings) -> Shared:
+        """Return what holds inside a document or group, or in what an include names.
 
         Args:
-            cursor: its root.
+            root: its keys.
             found: findings are appended here.
         """
-        parameters = build_parameters(cursor, found)
-        sim_time = cursor.get(SIM_TIME)
+        parameters = build_parameters(root, found)
+        sim_time = root.get(SIM_TIME)
         if sim_time is not None and SIM_TIME in parameters:
             message = f"cannot set {SIM_TIME} twice"
             found.append(
-                error("manifest.duplicate-parameter", sim_time.key_at, message, "remove one")
+                error("manifest.duplicate-parameter", sim_time.key_at(), message, "remove one")
             )
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
-            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at)
-        remap = {name: (each.value.text, each.key_at) for name, each in cursor.entries("remap")}
-        written = cursor.build(Supervision)
-        supervision = {
-            key: (getattr(written, key), each.at)
-            for key in SUPERVISION_KEYS
-            if (each := cursor.get(key)) is not None
-        }
+            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at())
+        remap = {name: (each.root.text, each.key_at()) for name, each in root.entries("remap")}
+        keys = {key: value for key, value in root.plain().items() if key in SUPERVISION_KEYS}
+        written = read(keys, Supervision, strict=False)
+        supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
         return Shared(
-            machine=cursor.text("machine", self.machine),
+            prefix=self.key(root.text("prefix")) if "prefix" in root else self.prefix,
+            namespace=self.within(root.text("namespace")),
+            machine=root.text("machine", self.machine),
             parameters={**self.parameters, **parameters},
             remap={**self.remap, **remap},
             supervision={**self.supervision, **supervision},
         )
+
+    def key(self, key: str) -> str:
+        """Return what a key of a node here is called in the system."""
+        return f"{self.prefix}/{key}" if self.prefix else key
+
+    def within(self, namespace: str) -> str:
+        """Return a namespace below the one here, without slashes at its ends."""
+        return "/".join(each for each in (self.namespace, namespace.strip("/")) if each)
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself."""

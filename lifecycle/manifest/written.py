@@ -7,7 +7,7 @@ Owns: which keys there are, what their values may be, and what editors and messa
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
@@ -37,9 +37,11 @@ from lifecycle.manifest.model import (
     spelled,
 )
 from lifecycle.manifest.model import Health as NodeHealth
+from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
 T = TypeVar("T")
+B = TypeVar("B", bound=Struct)
 
 
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
@@ -150,6 +152,26 @@ def read(plain: object, type_: type[T], *, strict: bool = True) -> T:
         msgspec.ValidationError: it does not fit. This says one thing that is wrong, and not well.
     """
     return msgspec.convert(plain, type_, strict=strict, dec_hook=read_special)
+
+
+def read_part(document: Document, type_: type[T], place: Place = ()) -> T:
+    """Return a part of a valid document as its type; all its defaults where it is not written."""
+    return read(document.plain(place), type_, strict=False)
+
+
+def build(type_: type[B], section: Struct, /, **computed: Any) -> B:
+    """Return what the model has of a section: the fields of the same name, and those computed.
+
+    Args:
+        type_: a type of `model`; what is not written (None) keeps its default there.
+        section: as it is written.
+        computed: fields that are more than the value of their key.
+    """
+    for name in type_.__struct_fields__:
+        value = getattr(section, name, None)
+        if value is not None:
+            computed.setdefault(name, value)
+    return type_(**computed)
 
 
 class Argument(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

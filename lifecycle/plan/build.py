@@ -382,7 +382,7 @@ def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodePar
     """Plan nodes, flows and how they are connected, but no processes and no order yet."""
     domain_id = effective_domain(manifest.discovery, variables)
     prefixes = search_prefixes(variables)
-    needs = FlowNeeds(manifest, prefixes)
+    needs = FlowNeeds(manifest)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
     digest_of = functools.cache(_digest)
     nodes = tuple(
@@ -545,8 +545,5 @@ def _planned_endpoint(
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
         max_delay_ms=need.max_delay_ms,
-        max_message_size=need.max_message_size,
-        max_message_size_reason=""
-        if need.max_message_size == need.need.max_message_size
-        else "the bound of its type",
+        max_message_size=need.need.max_message_size,
     )

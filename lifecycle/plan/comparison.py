@@ -207,11 +207,9 @@ def _flows(node: PlannedNode) -> _Tree:
             for name in _FLOW
             if getattr(each, name) != _NOT_ASKED[name]
         }
-        if each.five_qi_reason:  # proposed from sizes, which are known where types are installed
+        if each.five_qi_reason:  # proposed for what is declared
             asked.pop("dscp", None)
             asked["five_qi"] = "auto"
-        if each.max_message_size_reason:
-            asked.pop("max_message_size", None)
         if not each.enforce_dscp:
             asked["enforce"] = False
         if each.participant in waiting:

@@ -156,9 +156,7 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
         five_qi_reason: why it is this 5QI, or none, where the manifest has `auto`; else empty.
         participant: base name of the PlannedParticipant that carries it; empty for the node's own.
         max_delay_ms: declared bound, or the shortest of the links on its topic; None without.
-        max_message_size: largest serialized message, bytes: as declared, else the type's bound;
-            None if the type has none or is not installed here.
-        max_message_size_reason: source of a size that is not written as such; empty if it is.
+        max_message_size: largest serialized message, bytes, as declared.
         type_hash: of the definition that is installed here (REP-2016), as `ObservedEndpoint` has
             it; empty if the type is not installed here, or without hashes.
     """
@@ -179,7 +177,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
     participant: str = ""
     max_delay_ms: float | None = None
     max_message_size: Positive | None = None
-    max_message_size_reason: str = ""
     type_hash: str = ""
 
 

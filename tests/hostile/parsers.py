@@ -17,7 +17,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.graph.status import NodeStatus, NodeStatusError, encode
 from lifecycle.graph.status import decode as decode_status
 from lifecycle.manifest.diagnostics import ManifestError, Position
-from lifecycle.manifest.installed_types import bounded_size, installed_hash
+from lifecycle.manifest.installed_types import installed_hash
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
@@ -72,7 +72,7 @@ def _installed(data: bytes, folder: Path) -> object:
     for name in ("share/ament_index/resource_index/rosidl_interfaces/a", "share/a/msg/B.json"):
         (folder / name).parent.mkdir(parents=True)
         (folder / name).write_bytes(data)
-    return bounded_size("a/msg/B", [folder]), installed_hash("a/msg/B", [folder])
+    return installed_hash("a/msg/B", [folder])
 
 
 def _nodl(path: Path) -> object:
@@ -123,13 +123,6 @@ publishers:
 parameters:
   rate: {type: double, default_value: 1.0}
 """
-_FIELDS = [
-    {"type": {"type_id": 107, "capacity": 4, "string_capacity": 0, "nested_type_name": ""}},
-    {"type": {"type_id": 21, "capacity": 0, "string_capacity": 9, "nested_type_name": ""}},
-]
-_DESCRIPTION = json.dumps(
-    {"type_description_msg": {"type_description": {"fields": _FIELDS}}}
-).encode()
 _HASHES = json.dumps(
     {"type_hashes": [{"type_name": "a/msg/B", "hash_string": "RIHS01_ab"}]}
 ).encode()
@@ -202,7 +195,6 @@ READERS: dict[str, Reader] = {
     ),
     "output of a tool": Reader(good=b"qdisc htb 1f10:", read=_printed, errors=()),
     "NoDL document": Reader(good=_NODL, read=_file("a.nodl.yaml", _nodl), errors=(ManifestError,)),
-    "installed type description": Reader(good=_DESCRIPTION, read=_installed, errors=()),
     "installed type hashes": Reader(good=_HASHES, read=_installed, errors=()),
     "manifest": Reader(
         good=_MANIFEST, read=_file("m.lifecycle.yaml", load), errors=(ManifestError,)

@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
 from lifecycle.network.nfe import is_loopback, may_be_same
-from lifecycle.network.ports import DG, MAX_DOMAIN_ID, domain_base, owner_of
+from lifecycle.network.ports import DG, domain_base, owner_of
 
 _WORDS = {
     "port": "port",
@@ -159,11 +159,7 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
     """Judge ports that participants of the system's own domain take by themselves."""
     discovery = system.manifest.discovery
     domain = discovery.domain_id or 0
-    if (
-        discovery.mode is not DiscoveryMode.DYNAMIC
-        or not discovery.transport.by_udp
-        or not 0 <= domain <= MAX_DOMAIN_ID
-    ):
+    if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
         return
     for use in uses:
         owner = None if use.tcp else owner_of(use.port)
@@ -189,7 +185,7 @@ def _peers(
     """Warn of peers that match no participant of the system."""
     discovery = system.manifest.discovery
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and not discovery.transport.in_memory
-    domain = domain_base(min(max(discovery.domain_id or 0, 0), MAX_DOMAIN_ID))
+    domain = domain_base(discovery.domain_id or 0)
     for peer in url.peers:
         if peer.port is None or planned or domain <= peer.port < domain + DG:
             continue

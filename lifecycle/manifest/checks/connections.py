@@ -33,7 +33,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import Medium
 
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",
@@ -179,14 +178,13 @@ def _flows(
     node: Node, connection: ConnectionDeclaration, system: DeclaredSystem
 ) -> Iterator[Diagnostic]:
     """Judge needs of flows against the connection that carries them."""
-    transports = {url.transport for url in connection.urls}
     found = [
         (kind, each)
         for kind, name in connection.map
         if (each := system.needs.of(node.key, kind, name)) is not None
     ]
-    for kind, each in found:
-        yield from _carrier(connection, kind, each, transports)
+    for _, each in found:
+        yield from _lossy(connection, each)
     publisher = EndpointKind.PUBLISHER
     publishers = [name for kind, name in connection.map if kind is publisher]
     for kind, each in found:
@@ -202,44 +200,15 @@ def _flows(
             yield from _marked_apart(connection, each, sharing)
 
 
-def _what(kind: EndpointKind, each: ResolvedNeed) -> str:
-    return f"{kind.noun} {each.need.name!r}"
-
-
-def _carrier(
-    connection: ConnectionDeclaration,
-    kind: EndpointKind,
-    each: ResolvedNeed,
-    transports: set[Medium],
-) -> Iterator[Diagnostic]:
-    if not transports:
-        return
-    rule, what = "check.connection-flow", _what(kind, each)
-    spelled = ", ".join(sorted(transports))
-    if not transports & {*each.need.transport.media}:
+def _lossy(connection: ConnectionDeclaration, each: ResolvedNeed) -> Iterator[Diagnostic]:
+    transports = [url.transport for url in connection.urls]
+    if each.need.lossy is False and transports and all(one.is_group for one in transports):
         message = (
-            f"cannot carry {what} by {each.need.transport.value}: connection "
-            f"{connection.name!r} has {spelled}"
-        )
-        hint = "add a URL of that transport to it, or remove 'transport'"
-        yield error(rule, each.need.at, message, hint)
-    if each.need.lossy is False and all(one.is_group for one in transports):
-        message = (
-            f"cannot carry {what}, whose data are declared not lossy, by multicast alone, as "
-            f"connection {connection.name!r} does"
+            f"cannot carry {each.need.kind.noun} {each.need.name!r}, whose data are declared not "
+            f"lossy, by multicast alone, as connection {connection.name!r} does"
         )
         hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
-        yield error(rule, each.need.at, message, hint)
-    if (
-        kind is EndpointKind.SUBSCRIPTION
-        and each.unique
-        and not any(one.is_udp for one in transports)
-    ):
-        message = (
-            f"cannot give {what} a port of its own on connection {connection.name!r}: it has "
-            f"{spelled}, and only UDP has one port for each subscription"
-        )
-        yield error(rule, each.need.at, message, "add a UDP URL to it, or remove 'unique'")
+        yield error("check.connection-flow", each.need.at, message, hint)
 
 
 def _apart(

@@ -31,7 +31,6 @@ from lifecycle.network.dscp import MAX_DSCP, describe
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 
-_FIVE_QI = range(1, 255)  # one octet, 0 and 255 reserved (TS 24.501 §9.11.4.12)
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
@@ -90,9 +89,6 @@ def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
         )
         yield error("check.flow-dscp", need.at, message, f"keep one; {_both(need)}")
         return
-    if need.dscp is not None and not 0 <= need.dscp <= MAX_DSCP:
-        message = f"cannot use DSCP {need.dscp}; allowed: 0 to {MAX_DSCP}"
-        yield error("check.flow-dscp", need.at, message)
     message, hint = each.marking.problem
     if message and need.transport_priority is not None:
         yield error("check.flow-dscp", need.at, message, hint)
@@ -111,16 +107,11 @@ def _is_best_effort(node: Node, need: FlowNeed) -> bool:
 
 def _both(need: FlowNeed) -> str:
     dscp, priority = need.dscp or 0, need.transport_priority or 0
-    spelled = describe(dscp) if 0 <= dscp <= MAX_DSCP else f"DSCP {dscp}"
-    return f"the one is {spelled}, the other goes through a mapping from {priority:#x}"
+    return f"the one is {describe(dscp)}, the other goes through a mapping from {priority:#x}"
 
 
 def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
     need, class_ = each.need, each.flow_class
-    if need.five_qi is not None and need.five_qi not in _FIVE_QI:
-        message = f"cannot use five_qi {need.five_qi}; allowed: {_FIVE_QI[0]} to {_FIVE_QI[-1]}"
-        yield error("check.flow-five-qi", need.at, message)
-        return
     message, hint = class_.problem
     if message:
         yield error("check.flow-five-qi", need.at, message, hint)
@@ -267,7 +258,7 @@ def _relying(system: DeclaredSystem) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     for each, need in _needy(system, EndpointKind.PUBLISHER):
         if need.dscp is None or need.need.unique is not UniqueRequirement.NOT_REQUIRED:
             continue
-        if (each.node.key, each.name) in demanded and 0 <= need.dscp <= MAX_DSCP:
+        if (each.node.key, each.name) in demanded:
             yield each, need
 
 

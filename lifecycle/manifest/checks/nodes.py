@@ -41,7 +41,6 @@ from lifecycle.network.ports import (
     LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
-    MAX_DOMAIN_ID,
     EphemeralRange,
     describe_domains,
     domain_of,
@@ -349,10 +348,6 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
     at = system.manifest.where("discovery", start)
-    if not 0 <= domain <= MAX_DOMAIN_ID:
-        message = f"cannot use domain id {domain}; allowed: 0 to {MAX_DOMAIN_ID}"
-        yield error("check.domain", at, message, "Fast DDS ends every process beyond it")
-        return
     if max_participants(domain, LINUX).participants == 0:
         domains = describe_domains(safe_domains(LINUX))
         message = (

@@ -111,7 +111,7 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     @functools.cached_property
     def needs(self) -> FlowNeeds:
         """What the endpoints of the system ask of their flows."""
-        return FlowNeeds(self.manifest, self.prefixes)
+        return FlowNeeds(self.manifest)
 
     def rmw_of(self, node: Node) -> str:
         """Return the RMW identifier that a node will run with."""

@@ -4,6 +4,7 @@ Owns: check.discovery-range, check.discovery-address, check.discovery-rmw,
 check.discovery-transport, check.discovery-server, check.discovery-foreign, check.authority;
 check.flow-transport, check.flow-fragments, check.ipv6-transports, check.rmw. The capability
 table is in `lifecycle.network`; what happens at run time decides, check.rmw only fails earlier.
+Whether two nodes have a transport in common is the planner's to say (plan.unconnectable).
 Pure.
 """
 
@@ -24,7 +25,6 @@ from lifecycle.manifest.model import (
     DiscoveryRange,
     EndpointKind,
     FlowTransport,
-    Link,
     Node,
     RunKind,
 )
@@ -304,8 +304,9 @@ def check_transport(system: DeclaredSystem) -> Iterator[Diagnostic]:
             if each.need.kind is EndpointKind.PUBLISHER:
                 yield from _fragments(system, node, each)
     for link in system.manifest.links:
-        if link.transport is not FlowTransport.ANY:
-            yield from _link(system, link)
+        for end in (link.from_node, link.to_node):
+            if link.transport is not FlowTransport.ANY and end in system.nodes:
+                yield from _rmw(system, system.nodes[end], link.transport, link.at)
     yield from _ipv6(system)
 
 
@@ -320,19 +321,6 @@ def _wish(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Di
         )
         hint = "use 'transport: tcpv4', or remove 'lossy: false'"
         yield error(_RULE, need.at, message, hint)
-    for end in system.named(need.kind.other_end, each.topic):
-        ends = (node, end.node) if need.kind is EndpointKind.PUBLISHER else (end.node, node)
-        yield from _pair(system, ends, each.topic, need.transport, need.at)
-
-
-def _link(system: DeclaredSystem, link: Link) -> Iterator[Diagnostic]:
-    ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
-    if ends[0] is None or ends[1] is None:
-        return  # reported by check.link-unknown-node
-    for node in ends:
-        if node is not None:
-            yield from _rmw(system, node, link.transport, link.at)
-    yield from _pair(system, (ends[0], ends[1]), link.topic, link.transport, link.at)
 
 
 def _foreign(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -373,62 +361,15 @@ def _rmw(
         yield error(_RULE, at, message, hint)
 
 
-def _pair(
-    system: DeclaredSystem,
-    ends: tuple[Node, Node],
-    topic: str,
-    transport: FlowTransport,
-    at: Position,
-) -> Iterator[Diagnostic]:
-    """Judge what is asked for between two nodes by where they run."""
-    node, end = ends
-    one, two = system.manifest.address_of(node.machine), system.manifest.address_of(end.machine)
-    if one == two and end.process_name == node.process_name:
-        if transport.medium and transport.medium.stays_on_host:
-            return
-        by = "the network" if transport is FlowTransport.NETWORK else transport.value
-        both = "it" if node is end else f"{node.key!r} and {end.key!r}"
-        message = (
-            f"cannot send {topic!r} from process {node.process_name!r} to itself by {by}: {both} "
-            f"{'is' if node is end else 'are'} in it, and inside a process no transport is used"
-        )
-        hint = f"give one of the two another 'process:', or drop 'transport: {transport.value}'"
-        yield error(_RULE, at, message, hint)
-        return
-    if one == two:
-        return
-    here = "this host"
-    between = f"between {node.key!r} at {one or here} and {end.key!r} at {two or here}"
-    if transport.in_memory:
-        message = f"cannot send {topic!r} by shm {between}: shared memory does not leave a host"
-        yield error(_RULE, at, message, "use 'transport: udpv4' or 'tcpv4'")
-    elif one and two and (":" in one) != (":" in two):
-        message = (
-            f"cannot send {topic!r} by the network {between}: one address is IPv6, the other is not"
-        )
-        yield error(_RULE, at, message, "give both one kind of address")
-    else:
-        version = transport.medium.ip_version if transport.medium else None
-        wrong = [each for each in (one, two) if each and (6 if ":" in each else 4) != version]
-        if version and wrong:
-            message = (
-                f"cannot send {topic!r} by {transport.value} {between}: {wrong[0]} is no "
-                f"IPv{version} address"
-            )
-            hint = "use 'transport: udpv6'" if version == 4 else "use 'transport: udpv4' or 'tcpv4'"
-            yield error(_RULE, at, message, hint)
-
-
 def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    size = each.max_message_size
+    size = each.need.max_message_size
     if each.max_datagram_bytes is None or size is None:
         return
     limit = system.manifest.network.max_datagram_bytes or max_unfragmented(
         ipv6=":" in system.manifest.address_of(node.machine)
     )
-    declared = "declared" if each.need.max_message_size is not None else "the bound of its type"
     message = (
-        f"cannot send a message of {each.need.name!r}, up to {size} bytes ({declared}), in one "
+        f"cannot send a message of {each.need.name!r}, up to {size} bytes (declared), in one "
         f"datagram: with {RTPS_OVERHEAD_BYTES} bytes of RTPS it is {datagram_bytes(size)} of UDP "
         f"payload and {limit} fit; of IP's fragments only the first has ports, so a network would "
         f"not know the others as this flow"

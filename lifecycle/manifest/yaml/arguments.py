@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error, warning
+from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, warning
 from lifecycle.manifest.yaml.substitutions import (
     NOWHERE,
     NotRunError,
@@ -62,7 +62,7 @@ def substitute(
     given: Mapping[str, str],
     surroundings: Surroundings = NOWHERE,
     *,
-    include: Cursor | None = None,
+    include: Document | None = None,
 ) -> Substituted:
     """Resolve a document's arguments, then every substitution in its values.
 
@@ -76,7 +76,7 @@ def substitute(
     work = _Substitution(document, surroundings, include)
     work.resolve_arguments(given)
     return Substituted(
-        document=replace(document, root=work.system(document.root)),
+        document=replace(document, root=work.value(document.root)),
         arguments=tuple(work.values.items()),
         diagnostics=tuple(work.found),
         broken=tuple(work.broken),
@@ -84,16 +84,23 @@ def substitute(
     )
 
 
+def _may_have_conditions(place: Place) -> bool:
+    """Whether a node, an include or a group is there, of the document or of a group in it."""
+    while len(place) > 2 and place[0] == "groups":
+        place = place[2:]
+    return len(place) == 2 and place[0] in ("nodes", "include", "groups")
+
+
 class _Substitution:
     """One run over one document."""
 
     def __init__(
-        self, document: Document, surroundings: Surroundings, include: Cursor | None
+        self, document: Document, surroundings: Surroundings, include: Document | None
     ) -> None:
         self.values: dict[str, str] = {}
         self.found: list[Diagnostic] = []
         self.broken: list[Place] = []
-        self.left_out: list[Place] = []
+        self.left_out: dict[Place, None] = {}
         self.open: set[Place] = set()
         self._document = document
         self._surroundings = surroundings
@@ -115,8 +122,7 @@ class _Substitution:
                 message = f"cannot set the argument {quote(name)}; {known}"
                 at = self._document.key_at(("arguments",))
                 if self._include:
-                    owner = self._include
-                    at = owner.document.key_at((*owner.place, "arguments", name))
+                    at = self._include.key_at(("arguments", name))
                 hint = did_you_mean(name, declared)
                 self.found.append(error("manifest.unknown-argument", at, message, hint))
         for name in declared:
@@ -144,8 +150,7 @@ class _Substitution:
             message = f"cannot do without a value for the argument {name!r}{what}"
             hint = f"give {name}:=VALUE on the command line, or a default here"
             if self._include:
-                at = self._include.at
-                hint = f"add it to the arguments of the include at {at.spelled}"
+                hint = f"add it to the arguments of the include at {self._include.at().spelled}"
             where = self._document.key_at(place)
             self.found.append(error("manifest.missing-argument", where, message, hint))
             return None
@@ -167,30 +172,6 @@ class _Substitution:
                 did_you_mean(value, allowed),
             )
 
-    def system(self, value: Value, place: Place = ()) -> Value:
-        """Return a document's root, or a group, without the nodes that are left out."""
-        if not isinstance(value.data, Mapping):
-            return self.value(value, place)
-        data = dict(value.data)
-        for key, each in value.data.items():
-            inside = (*place, key)
-            if key == "nodes" and isinstance(each.data, Mapping):
-                data[key] = self._nodes(each, each.data, inside)
-            elif key in ("include", "groups") and isinstance(each.data, tuple):
-                items = tuple(
-                    self._item(item, (*inside, index)) for index, item in enumerate(each.data)
-                )
-                data[key] = replace(each, data=items)
-            elif key not in CONDITIONS and (place or key != "arguments"):
-                data[key] = self.value(each, inside)
-        return replace(value, data=self._known(data, place))
-
-    def _known(self, entries: dict[str, Value], place: Place) -> dict[str, Value]:
-        """Return the entries of a mapping whose values do not depend on programs."""
-        if not self.open:
-            return entries
-        return {key: each for key, each in entries.items() if (*place, key) not in self.open}
-
     def _open(self, place: Place, problem: LifecycleError) -> None:
         """Leave a value out that a program would write; what must be there is an error."""
         if "arguments" in place[:1] or place[-1] in CONDITIONS:
@@ -200,22 +181,6 @@ class _Substitution:
         self.open.add(place)
         at = self._document.at(place)
         self.found.append(warning("manifest.command-not-run", at, problem.message, problem.hint))
-
-    def _nodes(self, value: Value, nodes: Mapping[str, Value], place: Place) -> Value:
-        kept = {}
-        for key, node in nodes.items():
-            inside = (*place, key)
-            known = self._conditions(node, inside)
-            if known is None:
-                continue
-            kept[key] = node if inside in self.broken else self.value(known, inside)
-        return replace(value, data=kept)
-
-    def _item(self, value: Value, place: Place) -> Value:
-        known = self._conditions(value, place)
-        if known is None or place in self.broken:
-            return value
-        return self.system(known, place) if place[-2] == "groups" else self.value(known, place)
 
     def _conditions(self, value: Value, place: Place) -> Value | None:
         """Return what has `if:` or `unless:` with their values; None if it is left out.
@@ -245,7 +210,7 @@ class _Substitution:
             self._break((*place, "unless"), place, message, hint)
             return value
         if known and known[written[0]].data is not (written[0] == "if"):
-            self.left_out.append(place)
+            self.left_out[place] = None
             return None
         return replace(value, data={**value.data, **known}) if known else value
 
@@ -253,8 +218,17 @@ class _Substitution:
         self._report("manifest.condition", at, message, hint)
         self.broken.append(place)
 
-    def value(self, value: Value, place: Place) -> Value:
-        """Return `value` with every substitution inside it resolved."""
+    def value(self, value: Value, place: Place = ()) -> Value:
+        """Return `value` with every substitution inside it resolved, and no node that is left out.
+
+        Whatever else is left out stays as it is written, and so does `arguments:`.
+        """
+        done: tuple[str, ...] = () if place else ("arguments",)
+        if _may_have_conditions(place):
+            known = self._conditions(value, place)
+            if known is None or place in self.broken:
+                return value
+            value, done = known, CONDITIONS
         if isinstance(value.data, tuple):
             items = tuple(
                 self.value(each, (*place, index)) for index, each in enumerate(value.data)
@@ -263,8 +237,18 @@ class _Substitution:
                 self.open.add(place)
             return replace(value, data=items)
         if isinstance(value.data, Mapping):
-            entries = {key: self.value(each, (*place, key)) for key, each in value.data.items()}
-            return replace(value, data=self._known(entries, place))
+            entries = {
+                key: each if key in done else self.value(each, (*place, key))
+                for key, each in value.data.items()
+            }
+            return replace(
+                value,
+                data={
+                    key: each
+                    for key, each in entries.items()
+                    if (*place, key) not in self.open and (*place, key) not in self.left_out
+                },
+            )
         if "$" not in value.text:
             return value
         if len(self.found) > MAX_FINDINGS:

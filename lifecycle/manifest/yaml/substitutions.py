@@ -12,13 +12,13 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import selectors
 import shlex
 import shutil
 import signal
 import subprocess
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -267,76 +267,60 @@ class Programs:
             if " " not in name:
                 hint = "install it, or source the setup file of its workspace"
             raise LifecycleError(f"cannot run {quote(name)}: {where}", hint=hint)
-        try:
-            process = subprocess.Popen(
-                [os.path.abspath(program), *words[1:]],  # noqa: PTH100
-                cwd=folder,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-            )
-        except (OSError, ValueError) as problem:
-            why = getattr(problem, "strerror", None) or problem
-            raise LifecycleError(f"cannot run {quote(name)}: {why}") from problem
-        try:
-            out, err = _read(process, name)
-        finally:
-            # Whatever it has started ends with it, before its group's number can be another's.
-            with contextlib.suppress(OSError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            try:
+                process = subprocess.Popen(
+                    [os.path.abspath(program), *words[1:]],  # noqa: PTH100
+                    cwd=folder,
+                    env=self._environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    start_new_session=True,
+                )
+            except (OSError, ValueError) as problem:
+                why = getattr(problem, "strerror", None) or problem
+                raise LifecycleError(f"cannot run {quote(name)}: {why}") from problem
+            try:
+                _await_end(process, (out, err), name)
+            finally:
+                # Whatever it has started ends with it, before its group's number can be another's.
+                with contextlib.suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+            written, said = (os.pread(each.fileno(), MAX_BYTES, 0) for each in (out, err))
         shown = quote(" ".join(words), limit=200)
         if process.returncode:
-            said = err.decode("utf-8", "replace").strip().splitlines()[-1:]
+            last = said.decode("utf-8", "replace").strip().splitlines()[-1:]
             ended = (
                 f"exit status {process.returncode}"
                 if process.returncode > 0
                 else f"signal {-process.returncode}"
             )
-            why = f": {quote(said[0], limit=300)}" if said else ""
+            why = f": {quote(last[0], limit=300)}" if last else ""
             hint = f"run it: {shlex.join(words)}"
             raise LifecycleError(f"cannot use {shown}: it ended with {ended}{why}", hint=hint)
         try:
-            return _without_last_break(decode(out, file=name))
+            return _without_last_break(decode(written, file=name))
         except ManifestError as problem:
             message = problem.diagnostics[0].message.removeprefix("cannot read ")
             raise LifecycleError(f"cannot use what {shown} writes: {message}") from problem
 
 
-def _read(process: subprocess.Popen[bytes], name: str) -> tuple[bytes, bytes]:
-    """Read both streams of a program to their end and wait for its end, within the limits."""
-    assert process.stdout is not None
-    assert process.stderr is not None
-    held: dict[IO[bytes], bytearray] = {process.stdout: bytearray(), process.stderr: bytearray()}
+def _await_end(process: subprocess.Popen[bytes], files: Iterable[IO[bytes]], name: str) -> None:
+    """Wait for the end of a program, within the limits of time and of what it writes."""
     deadline = time.monotonic() + COMMAND_S
-    late = LifecycleError(f"cannot wait for {quote(name)}: it takes more than {COMMAND_S:g} s")
-    with selectors.DefaultSelector() as selector, process.stdout, process.stderr:
-        for stream in held:
-            selector.register(stream, selectors.EVENT_READ)
-        while selector.get_map():
-            left = deadline - time.monotonic()
-            ready = selector.select(left) if left > 0 else []
-            if not ready:
-                raise late
-            for key, _ in ready:
-                stream = next(each for each in held if each is key.fileobj)
-                data = os.read(stream.fileno(), 1 << 16)
-                if not data:
-                    selector.unregister(stream)
-                held[stream] += data
-                if len(held[stream]) > MAX_BYTES:
-                    if stream is process.stdout:
-                        message = f"cannot use {quote(name)}: it writes more than {MAX_BYTES} bytes"
-                        raise LifecycleError(message)
-                    del held[stream][:-4096]
-        try:
-            # Closed streams are no end: it may run on without them.
-            process.wait(max(deadline - time.monotonic(), 0.01))
-        except subprocess.TimeoutExpired:
-            raise late from None
-        return bytes(held[process.stdout]), bytes(held[process.stderr])
+    while True:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+        if any(os.fstat(each.fileno()).st_size > MAX_BYTES for each in files):
+            message = f"cannot use {quote(name)}: it writes more than {MAX_BYTES} bytes"
+            raise LifecycleError(message)
+        if process.returncode is not None:
+            return
+        if time.monotonic() > deadline:
+            message = f"cannot wait for {quote(name)}: it takes more than {COMMAND_S:g} s"
+            raise LifecycleError(message)
 
 
 def _without_last_break(text: str) -> str:

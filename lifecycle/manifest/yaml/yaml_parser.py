@@ -21,7 +21,6 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, NoReturn
 
-import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
@@ -157,14 +156,6 @@ MAX_FINDINGS = 200
 _SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
 
 
-class _Node(msgspec.Struct, frozen=True):
-    """A value, how many values it and all inside it are, and how deep these go."""
-
-    value: Value
-    values: int = 1
-    height: int = 0
-
-
 def events(text: str, *, file: str) -> Iterator[yaml.Event]:
     """Yield the parser's events.
 
@@ -217,7 +208,7 @@ class _Composer:
     def __init__(self, text: str, file: str) -> None:
         self._file = file
         self._events = self._parse(text)
-        self._anchors: dict[str, _Node | None] = {}  # None while still open
+        self._anchors: dict[str, Value | None] = {}  # None while still open
         self._found: list[Diagnostic] = []
         self._values = 0
         self._aliases = 0
@@ -237,12 +228,12 @@ class _Composer:
                 message = "cannot read more than one document in a file"
                 self._stop(_mark(event), (), message, "remove this '---'")
             elif isinstance(event, yaml.NodeEvent):
-                root = self._node(event, ()).value
+                root = self._node(event, ())
         if root is None:
             self._stop((1, 1), (), EMPTY, "start with 'manifest_version: 1'")
         return Document(file=self._file, root=root), tuple(self._found)
 
-    def _node(self, event: yaml.Event, place: Place) -> _Node:
+    def _node(self, event: yaml.Event, place: Place) -> Value:
         """Return what begins with an event; its place has a step for each collection around it."""
         import yaml
 
@@ -250,7 +241,7 @@ class _Composer:
         if isinstance(event, yaml.AliasEvent):
             return self._alias(event.anchor, mark, place)
         if isinstance(event, yaml.ScalarEvent):
-            node = _Node(self._scalar(event, place))
+            value = self._scalar(event, place)
         else:
             assert isinstance(event, yaml.CollectionStartEvent)
             self._refuse_tag(event.tag, mark, place)
@@ -258,35 +249,35 @@ class _Composer:
                 self._stop(mark, place, _TOO_DEEP)
             self._begin(event, place)
             is_mapping = isinstance(event, yaml.MappingStartEvent)
-            node = self._mapping(mark, place) if is_mapping else self._sequence(mark, place)
+            data = self._mapping(place) if is_mapping else self._sequence(place)
+            value = Value(data=data, line=mark[0], column=mark[1])
         if event.anchor is not None:
-            self._anchors[event.anchor] = node
-        return node
+            self._anchors[event.anchor] = value
+        return value
 
     def _begin(self, event: yaml.NodeEvent, place: Place) -> None:
-        self._count(1, _mark(event), place)
+        self._count(_mark(event), place)
         if event.anchor is not None:
             self._anchors[event.anchor] = None
 
-    def _sequence(self, mark: _Mark, place: Place) -> _Node:
+    def _sequence(self, place: Place) -> tuple[Value, ...]:
         import yaml
 
-        inside: list[_Node] = []
+        inside: list[Value] = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
             inside.append(self._node(event, (*place, len(inside))))
-        return _collection(tuple(each.value for each in inside), mark, inside)
+        return tuple(inside)
 
-    def _mapping(self, mark: _Mark, place: Place) -> _Node:
+    def _mapping(self, place: Place) -> dict[str, Value]:
         import yaml
 
         data: dict[str, Value] = {}
-        inside: list[_Node] = []
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             key, is_kept = self._key(event, data, place)
-            inside.append(self._node(next(self._events), (*place, key)))
+            value = self._node(next(self._events), (*place, key))
             if is_kept:
-                data[key] = replace(inside[-1].value, key=_mark(event))
-        return _collection(data, mark, inside)
+                data[key] = replace(value, key=_mark(event))
+        return data
 
     def _scalar(self, event: yaml.ScalarEvent, place: Place) -> Value:
         mark = _mark(event)
@@ -307,7 +298,7 @@ class _Composer:
                 self._note("yaml.number", mark, place, message)
         return Value(data=data, line=mark[0], column=mark[1], text=event.value, quoted=quoted)
 
-    def _alias(self, anchor: str | None, mark: _Mark, place: Place) -> _Node:
+    def _alias(self, anchor: str | None, mark: _Mark, place: Place) -> Value:
         self._aliases += 1
         if self._aliases > MAX_ALIASES:
             self._stop(mark, place, f"cannot read more than {MAX_ALIASES} aliases")
@@ -316,10 +307,17 @@ class _Composer:
         anchored = self._anchors[anchor]
         if anchored is None:
             self._stop(mark, place, f"cannot use the alias '*{anchor}' inside its own anchor")
-        self._count(anchored.values, mark, place)
-        if len(place) + anchored.height > MAX_DEPTH:
-            self._stop(mark, place, _TOO_DEEP)
-        return replace(anchored, value=replace(anchored.value, line=mark[0], column=mark[1]))
+        self._expand(anchored, len(place), mark, place)
+        return replace(anchored, line=mark[0], column=mark[1])
+
+    def _expand(self, value: Value, depth: int, mark: _Mark, place: Place) -> None:
+        """Count what an alias stands for, as if it was written out at a place."""
+        self._count(mark, place)
+        if isinstance(value.data, (tuple, dict)):
+            if depth >= MAX_DEPTH:
+                self._stop(mark, place, _TOO_DEEP)
+            for each in value.data.values() if isinstance(value.data, dict) else value.data:
+                self._expand(each, depth + 1, mark, place)
 
     def _key(self, event: yaml.Event, known: Mapping[str, Value], place: Place) -> tuple[str, bool]:
         """Return a key of the mapping at a place, and whether its value is kept."""
@@ -351,8 +349,8 @@ class _Composer:
             return key, True
         return key, False
 
-    def _count(self, values: int, mark: _Mark, place: Place) -> None:
-        self._values += values
+    def _count(self, mark: _Mark, place: Place) -> None:
+        self._values += 1
         if self._values > MAX_VALUES:
             self._stop(mark, place, f"cannot read more than {MAX_VALUES} values, aliases expanded")
 
@@ -379,16 +377,6 @@ class _Composer:
 
 
 _TOO_DEEP = f"cannot read values nested deeper than {MAX_DEPTH} levels"
-
-
-def _collection(
-    data: tuple[Value, ...] | dict[str, Value], mark: _Mark, inside: list[_Node]
-) -> _Node:
-    return _Node(
-        Value(data=data, line=mark[0], column=mark[1]),
-        values=1 + sum(each.values for each in inside),
-        height=1 + max((each.height for each in inside), default=0),
-    )
 
 
 def _explain(why: str, text: str, line: int, column: int) -> tuple[str, str]:

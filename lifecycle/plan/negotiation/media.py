@@ -247,11 +247,15 @@ def _list(words: Iterable[str]) -> str:
 
 def _none_common(pair: Pair, how: str = "") -> NegotiatedFlow:
     one, other = pair.publisher, pair.subscription
+    hint = (
+        f"shared memory does not leave a host, and an IP transport needs addresses of its version: "
+        f"{one.host or 'this host'} and {other.host or 'this host'}"
+    )
     return pair.problem(
         how,
         f"{one.key!r} can be connected by {_list(_able(one))}; {other.key!r} by "
         f"{_list(_able(other))}",
-        "" if pair.same_host else "they are on different hosts, where shared memory is none",
+        "" if pair.same_host else hint,
     )
 
 

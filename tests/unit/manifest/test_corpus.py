@@ -1,7 +1,7 @@
-"""Every document in tests/corpus, found automatically.
+"""Every document in tests/corpus, found automatically, loaded and planned as `check` does it.
 
 Format: `valid/NAME.lifecycle.yaml` loads; its warnings, if any, are the text of
-`valid/NAME.expected`. `invalid/NAME.lifecycle.yaml` does not load; its diagnostics, one per line,
+`valid/NAME.expected`. `invalid/NAME.lifecycle.yaml` has errors; its diagnostics, one per line,
 files by base name, are exactly the text of `invalid/NAME.expected`. A comment line
 `# corpus-arguments: a:=1 b:=2` gives arguments, `# corpus-environment: A=1` environment variables.
 Files in subdirectories are there to be included or referred to.
@@ -17,8 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.diagnostics import ManifestError, Severity
 from lifecycle.manifest.loading import load
+from lifecycle.plan.build import check_plan
 
 CORPUS = Path(__file__).parents[2] / "corpus"
 VALID = sorted((CORPUS / "valid").glob("*.lifecycle.yaml"))
@@ -37,7 +38,7 @@ def pairs(text: str, keyword: str, separator: str) -> dict[str, str]:
 
 
 def _load(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[bool, str]:
-    """Return whether the document loads and its diagnostics as text."""
+    """Return whether the document can be used, and its diagnostics as text."""
     text = path.read_bytes().decode("utf-8", errors="replace")
     monkeypatch.chdir(path.parent)
     for name, value in pairs(text, "corpus-environment", "=").items():
@@ -46,7 +47,9 @@ def _load(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[bool, str]:
         loaded = load(path.name, pairs(text, "corpus-arguments", ":="))
     except ManifestError as error:
         return False, "".join(f"{each}\n" for each in error.diagnostics)
-    return True, "".join(f"{each}\n" for each in loaded.warnings)
+    found = (*loaded.warnings, *check_plan(loaded.manifest, files=loaded.files))
+    is_sound = all(each.severity is not Severity.ERROR for each in found)
+    return is_sound, "".join(f"{each}\n" for each in found)
 
 
 def _compare(path: Path, text: str) -> None:

@@ -34,7 +34,7 @@ CORPUS = Path(__file__).parents[2] / "corpus" / "valid"
 def groups(*needs: FlowNeed, **rest: object) -> list[ParticipantGroup]:
     """The participants of one node whose publishers have these needs."""
     only = node("n", *(publisher(each.name) for each in needs), needs=needs)
-    return list(FlowNeeds(manifest(only, **rest), []).groups(only))
+    return list(FlowNeeds(manifest(only, **rest)).groups(only))
 
 
 def carried(*needs: FlowNeed, **rest: object) -> list[tuple[str, ...]]:
@@ -91,7 +91,7 @@ def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
             need(SUB, "b", transport=NETWORK),
         ],
     )
-    needs = FlowNeeds(manifest(only), [])
+    needs = FlowNeeds(manifest(only))
     assert needs.node_transports(only) == ("udpv4",)
     assert [(each.names, each.transports) for each in needs.groups(only)] == [(("c",), ("udpv4",))]
 
@@ -107,7 +107,7 @@ def class_of_the_publisher(*hearers: FlowNeed | None, run: RunKind = RunKind.PYT
         )
         for index, each in enumerate(hearers)
     ]
-    return [each.five_qi for each in FlowNeeds(manifest(source, *others), []).groups(source)]
+    return [each.five_qi for each in FlowNeeds(manifest(source, *others)).groups(source)]
 
 
 def test_a_5qi_needs_sockets_of_its_own_unless_the_subscriptions_tell_the_flow_apart():
@@ -158,7 +158,7 @@ def test_a_prioritised_publisher_gets_datagrams_that_ip_leaves_whole(
         machines=(Machine(name="m", address=address, at=at(1)),),
         network=Network(max_datagram_bytes=declared),
     )
-    assert [each.max_datagram_bytes for each in FlowNeeds(system, []).groups(only)] == [limit]
+    assert [each.max_datagram_bytes for each in FlowNeeds(system).groups(only)] == [limit]
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_network_transport_is_ipv6_where_the_machine_s_address_is():
     ):
         only = node("n", publisher("a"), needs=[need(PUB, "a", transport=NETWORK)], machine="m")
         system = manifest(only, machines=(Machine(name="m", address=address, at=at(1)),))
-        assert [each.transports for each in FlowNeeds(system, []).groups(only)] == [transports]
+        assert [each.transports for each in FlowNeeds(system).groups(only)] == [transports]
 
 
 # --- marks
@@ -251,7 +251,7 @@ def of_dscp(count: int, *needs: FlowNeed) -> tuple[FlowNeeds, Manifest]:
     ]
     nodes.append(node("other", *(publisher(each.name) for each in needs), needs=needs))
     system = manifest(*nodes, network=Network(flow_identification=FlowIdentification.DSCP))
-    return FlowNeeds(system, []), system
+    return FlowNeeds(system), system
 
 
 def test_each_publisher_that_needs_it_gets_a_dscp_that_no_other_has():
@@ -273,7 +273,7 @@ def test_a_publisher_that_others_start_cannot_be_marked_and_so_gets_no_identifie
         run=Run(kind=RunKind.COMMAND, command=("x",)),
     )
     system = manifest(foreign, network=Network(flow_identification=FlowIdentification.DSCP))
-    assert FlowNeeds(system, []).of("n", PUB, "a").dscp is None
+    assert FlowNeeds(system).of("n", PUB, "a").dscp is None
 
 
 # --- 5QI
@@ -281,7 +281,7 @@ def test_a_publisher_that_others_start_cannot_be_marked_and_so_gets_no_identifie
 
 def resolved(flow: FlowNeed, *links: object):
     only = node("n", publisher("a"), needs=[flow])
-    return FlowNeeds(manifest(only, links=links), []).of("n", PUB, "a")
+    return FlowNeeds(manifest(only, links=links)).of("n", PUB, "a")
 
 
 def test_auto_takes_the_shortest_delay_of_the_links_of_its_topic():

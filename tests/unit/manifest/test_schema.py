@@ -101,7 +101,7 @@ def test_a_substitution_that_is_left_over_does_not_pass_for_a_number() -> None:
         "manifest_version: 1\nsystem: s\nnodes: {a: {attach: true}}\n"
         "discovery: {domain_id: $(arg x)}\n"
     )
-    found = [str(each) for _, each in validate(parse(text, file="f"))]
+    found = [str(each) for each in validate(parse(text, file="f"))]
     assert found == [
         "f:4:24: discovery.domain_id: cannot use domain_id '$(arg x)'; it must be an integer"
     ]
@@ -109,7 +109,7 @@ def test_a_substitution_that_is_left_over_does_not_pass_for_a_number() -> None:
 
 def test_a_key_with_a_line_break_at_its_end_does_not_match_a_pattern() -> None:
     text = 'manifest_version: 1\nsystem: s\nnodes: {"a\\n": {attach: true}}\n'
-    ((_, only),) = validate(parse(text, file="f"))
+    (only,) = validate(parse(text, file="f"))
     assert str(only) == (
         "f:3:9: nodes[\"a\\n\"]: cannot use 'a\\n' as a key here; "
         "use letters, digits and '_', not a digit first"
@@ -122,7 +122,7 @@ def test_more_findings_than_a_person_reads_are_summed_up() -> None:
         parse(f"manifest_version: 1\nsystem: s\nnodes: {{a: {{attach: true}}}}\n{keys}", file="f")
     )
     assert len(found) == 201
-    assert str(found[-1][1]) == "f:1:1: cannot list more than 200 findings; fix these first"
+    assert str(found[-1]) == "f:1:1: cannot list more than 200 findings; fix these first"
 
 
 def _fits(plain: object, *, strict: bool) -> bool:

@@ -129,26 +129,6 @@ def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
     assert check(replace(made, links=links)) == ()
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("dscp", 64, "cannot use DSCP 64; allowed: 0 to 63"),
-        ("dscp", -1, "cannot use DSCP -1; allowed: 0 to 63"),
-        ("five_qi", 0, "cannot use five_qi 0; allowed: 1 to 254"),
-        ("five_qi", 256, "cannot use five_qi 256; allowed: 1 to 254"),
-    ],
-)
-def test_numbers_out_of_range_are_refused_even_from_a_program(
-    field: str, value: int, message: str
-) -> None:
-    made = streams(1, need=replace(MARKED, dscp=None))
-    source = made.nodes[0]
-    flows = (replace(source.flows[0], **{field: value}),)
-    nodes = (replace(source, flows=flows), *made.nodes[1:])
-    found = check(replace(made, nodes=nodes, links=()))
-    assert [each.message for each in found] == [message]
-
-
 def acknowledging(reliability: Reliability, **marks: int | None) -> Manifest:
     """A stream whose subscription is marked."""
     made = streams(1, need=MARKED)

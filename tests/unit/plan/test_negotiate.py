@@ -291,7 +291,8 @@ REFUSED = {
         {},
         (
             "cannot carry '/t' from 'p' to 's': 'p' can be connected by udpv4, shm; 's' by tcpv4; "
-            "they are on different hosts, where shared memory is none"
+            "shared memory does not leave a host, and an IP transport needs addresses of its "
+            "version: 10.77.0.1 and 10.77.0.2"
         ),
     ),
     "no wire format": (
