@@ -30,7 +30,6 @@ from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.written import read
 from lifecycle.manifest.yaml.document import Document, error, warning
 
-
 THIS_HOST = "local"
 """Name of the machine of nodes that name none; declared implicitly, without address."""
 
