@@ -138,11 +138,13 @@ def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
     tool.write_text(
         f"#!/bin/sh\ntouch {begun}\nfor each in $(seq 200); do\n"
         f"  test -e {go} && break; sleep 0.05\ndone\n"
+        "case $1 in -f) exit 0; esac\n"
         "echo 'Error: No such file or directory' >&2; exit 1\n"
     )
     tool.chmod(0o755)
     variables = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    manifest = pair(tmp_path, fresh_domain)
+    marked = {"publishers": {"chatter": {"dscp": "EF", "transport": "network"}}}
+    manifest = pair(tmp_path, fresh_domain, edit={"nodes/talker/flows": marked})
     with up(manifest, "--program", "nft", runtime=tmp_path, variables=variables) as run:
         run.until("system", reached="verified")
         until(begun.exists)
