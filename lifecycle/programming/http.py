@@ -18,7 +18,6 @@ from urllib.parse import quote, unquote, urlsplit
 import msgspec
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.settings import ServerSettings, readable
 from lifecycle.programming.target import HttpError, Means, ProgrammingError, SettingsError
 
@@ -144,6 +143,7 @@ class Api:
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
         self.clock = means.clock
+        self._is_local = settings.is_local
         self._token = settings.token
         self._timeout_s = settings.timeout_s
         self._patience = means.patience
@@ -152,7 +152,6 @@ class Api:
         self._client()  # so that a proxy that cannot be used is an error at once
 
     def _client(self) -> httpx.AsyncClient:
-        host = urlsplit(self.url).hostname or ""
         try:
             return httpx.AsyncClient(
                 # A redirect could carry the token elsewhere, so none is followed.
@@ -161,7 +160,7 @@ class Api:
                 verify=self._certificates,
                 # What is for this host goes to no proxy: it would read the token, and cannot even
                 # reach what it is for.
-                trust_env=not (host == "localhost" or is_loopback(host)),
+                trust_env=not self._is_local,
             )
         except (ValueError, ImportError, httpx.InvalidURL):
             # Not quoted: it may hold a password.

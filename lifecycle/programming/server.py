@@ -25,7 +25,7 @@ from lifecycle.errors import UsageError
 from lifecycle.programming.http import Api, as_segment, text_of
 from lifecycle.programming.ledger import Entry, TargetRecord
 from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
-from lifecycle.programming.settings import ServerSettings, device_networks, load_settings
+from lifecycle.programming.settings import IpNetwork, ServerSettings, load_settings
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -66,7 +66,7 @@ class DeviceEnd(NamedTuple):
         return ":" in self.device
 
 
-def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]:
+def device_ends(rule: FlowRule, networks: Sequence[IpNetwork]) -> tuple[DeviceEnd, ...]:
     """Return the ends of a flow that are devices: one or both.
 
     Raises:
@@ -80,7 +80,6 @@ def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]
         )
     source = (rule.source_address, rule.source_port)
     destination = (rule.destination_address, rule.destination_port)
-    networks = device_networks(devices)
     ends = (DeviceEnd(False, *destination, *source), DeviceEnd(True, *source, *destination))
     found = tuple(
         end for end in ends if any(ipaddress.ip_address(end.device) in each for each in networks)
@@ -227,6 +226,7 @@ class ServerTarget(Target):
         cls, rules: Iterable[FlowRule], server: Any
     ) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
         """Return one request per flow and device, and the flows that none can be made for."""
+        networks = server.networks
 
         def make(rule: FlowRule) -> list[Wanted]:
             return [
@@ -235,7 +235,7 @@ class ServerTarget(Target):
                     rule=rule,
                     body=cls.body(rule, end, server),
                 )
-                for end in device_ends(rule, server.devices)
+                for end in device_ends(rule, networks)
             ]
 
         made, left_out = expressed(rules, make)

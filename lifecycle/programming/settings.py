@@ -12,7 +12,7 @@ import errno
 import ipaddress
 import os
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -100,43 +100,51 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     timeout_s: float = 10.0
 
     def __post_init__(self) -> None:
-        _check_url(self.url, token=self.token)
+        self._check_url()
         if not 0 < self.timeout_s < float("inf"):
             raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
-        device_networks(self.devices)
+        if not self.networks:
+            raise ValueError(
+                "cannot tell which ends of flows are devices: devices is empty; name the addresses "
+                "or networks of the devices, such as 10.45.0.0/16"
+            )
+
+    @property
+    def networks(self) -> tuple[IpNetwork, ...]:
+        """What `devices` names.
+
+        Raises:
+            ValueError: something that is no network.
+        """
+        try:
+            return tuple(ipaddress.ip_network(each, strict=False) for each in self.devices)
+        except ValueError as error:
+            raise ValueError(
+                f"cannot use devices: {error}; use 10.45.0.0/16, for example"
+            ) from None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is on this host."""
+        host = urlsplit(self.url).hostname or ""
+        return host == "localhost" or is_loopback(host)
 
     @property
     def scope(self) -> str:
         """What the server is told apart from others by, and where it is asked: a URL."""
         return self.url.rstrip("/")
 
-
-def device_networks(devices: Iterable[str]) -> tuple[IpNetwork, ...]:
-    """Return the networks among what says which ends of flows are devices.
-
-    Args:
-        devices: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses.
-
-    Raises:
-        ValueError: not a network, or none at all: without it no end is known to be a device.
-    """
-    every = tuple(devices)
-    if not every:
-        raise ValueError(
-            "cannot tell which ends of flows are devices: devices is empty; name the addresses or "
-            "networks of the devices, such as 10.45.0.0/16"
-        )
-    return tuple(map(_network, every))
-
-
-def _network(text: str) -> IpNetwork:
-    try:
-        return ipaddress.ip_network(text, strict=False)
-    except ValueError:
-        raise ValueError(
-            f"cannot use {text!r} as a network of devices; "
-            f"use an address or a network, such as 10.45.0.0/16"
-        ) from None
+    def _check_url(self) -> None:
+        """A URL that a token may be sent to: https, or this host."""
+        url, parts = self.url, urlsplit(self.url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
+        if parts.username or parts.password:
+            raise ValueError("cannot use a url with a password in it; use token")
+        if parts.query or parts.fragment:
+            raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
+        if self.token is not None and parts.scheme == "http" and not self.is_local:
+            raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
 
 
 def load_settings(path: str | Path) -> dict[str, ServerSettings]:
@@ -195,17 +203,3 @@ def readable(error: Exception) -> str:
         return str(error)
     whose, _, path = where.strip("`").rpartition("` in `")
     return f"{'a key of ' if whose else ''}{path.lstrip('$.')}: {text}"
-
-
-def _check_url(url: str, *, token: Token | None) -> None:
-    """A URL that a token may be sent to: https, or this host."""
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
-    if parts.username or parts.password:
-        raise ValueError("cannot use a url with a password in it; use token")
-    if parts.query or parts.fragment:
-        raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
-    local = parts.hostname == "localhost" or is_loopback(parts.hostname)
-    if token is not None and parts.scheme == "http" and not local:
-        raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")

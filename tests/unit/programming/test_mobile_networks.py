@@ -148,8 +148,8 @@ def test_the_camara_export_says_what_each_body_is_for() -> None:
         (
             lambda: nef(devices=("robots",)),
             (
-                "cannot use 'robots' as a network of devices; "
-                "use an address or a network, such as 10.45.0.0/16"
+                "cannot use devices: 'robots' does not appear to be an IPv4 or IPv6 network; "
+                "use 10.45.0.0/16, for example"
             ),
         ),
         (
