@@ -21,7 +21,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
-from lifecycle.verify.rules.measured import NOT_MEASURED, measurements
+from lifecycle.verify.rules.measured import NOT_MEASURED, RULES, measurements
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
@@ -35,6 +35,7 @@ from lifecycle.verify.verdict import (
 )
 from lifecycle.verify.view import Actual, FlowView, View, flow_subject
 
+_OF_NUMBERS = frozenset(each.id for each in RULES)
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
@@ -202,6 +203,28 @@ def without_measured(verdict: Verdict, policy: Policy) -> Verdict:
     """Return `verdict` as it is while nodes pass a gate: what has arrived does not close it."""
     kept = tuple(each for each in verdict.findings if not rule(each.rule).measured)
     return replace(with_only(verdict, kept, policy), measured=())
+
+
+def with_measured(verdict: Verdict, others: Iterable[Verdict], policy: Policy) -> Verdict:
+    """Return `verdict` with what `others` measured of flows, and found, in place of its own."""
+    others = tuple(others)
+    theirs = {each.pair: each for other in others for each in other.measured}
+
+    def is_theirs(finding: Finding) -> bool:
+        """Whether it is of a number of such a flow, or of an endpoint that has no other flows."""
+        pairs = {
+            each.pair
+            for each in verdict.flows
+            if finding.subject in (each.topic, flow_subject(*each.pair))
+            and set(finding.nodes) <= {*each.pair}
+        }
+        return finding.rule in _OF_NUMBERS and bool(pairs) and pairs <= theirs.keys()
+
+    own = (each for each in verdict.findings if not is_theirs(each))
+    found = (each for other in others for each in other.findings if is_theirs(each))
+    measured = {each.pair: each for each in verdict.measured} | theirs
+    taken = with_only(verdict, (*own, *found), policy)
+    return replace(taken, measured=tuple(measured.values()))
 
 
 def apart_from_numbers(verdict: Verdict) -> Verdict:

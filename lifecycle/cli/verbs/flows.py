@@ -266,7 +266,7 @@ def _show(
     export_: str | None,
     **rest: Any,
 ) -> int:
-    from lifecycle.supervisor.run.looking import judge_running, supervisor_of
+    from lifecycle.supervisor.run import looking
 
     if record is None and (force or for_s is not None):
         raise UsageError("cannot use --for or --force without --record FILE")
@@ -290,18 +290,19 @@ def _show(
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
-    waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
+    waits = asked is not click.core.ParameterSource.DEFAULT or looking.supervisor_of(
+        os.environ, plan, ""
+    )
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
-    seen = judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
+    seen = looking.judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
+    seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         click.echo(lines(each), err=True)
     if exported is not None:
         export(seen.plan, seen.verdict.flows, *exported)
     else:
-        measured, colour = _numbers(plan, seen.verdict), sys.stdout.isatty()
-        click.echo(render_flows(seen.verdict.flows, format_, measured, colour=colour))
-        if any(each.violated for each in measured):
-            return ExitCode.VIOLATED
+        flows, measured = seen.verdict.flows, seen.verdict.measured
+        click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
     return exit_code(seen.verdict, strict=False)
 
 
@@ -313,17 +314,6 @@ def _measuring(plan: Plan) -> Path | None:
     takes = sorted({machine_of[each.subscription] for each in plan.flows}) if plan.bounds else []
     found = (supervisor_of(os.environ, plan, each) for each in ("", *takes) if takes)
     return next((each for each in found if each is not None), None)
-
-
-def _numbers(plan: Plan, verdict: Verdict) -> tuple[FlowMeasurement, ...]:
-    """Return what is measured: a supervisor knows how far the clocks of hosts are apart, too."""
-    from lifecycle.supervisor.control.client import status
-
-    found = {each.pair: each for each in verdict.measured}
-    if (path := _measuring(plan)) is not None:
-        with contextlib.suppress(UsageError, TimeoutError):  # it ends, or is busy
-            found |= {each.pair: each for each in status(path).measured}
-    return tuple(found.values())
 
 
 def _watch(plan: Plan, format_: str) -> int:

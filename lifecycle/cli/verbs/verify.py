@@ -44,11 +44,12 @@ def command(  # noqa: PLR0917 - click passes options by name
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            from lifecycle.supervisor.run.looking import judge_running
+            from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
             plan = load_plan(manifest, assignments)
             written.begin(plan)
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
+            seen = with_supervisors_numbers(seen)
             with ending.noted():
                 unwritten = written_or_said(lambda: written.end(seen.verdict))
     except Ended as ended:

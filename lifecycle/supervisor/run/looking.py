@@ -40,7 +40,7 @@ from lifecycle.supervisor.health.liveliness import not_answering
 from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.verify.judge import apart_from_numbers, verify, with_findings
+from lifecycle.verify.judge import apart_from_numbers, verify, with_findings, with_measured
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -129,6 +129,17 @@ def judge_running(
         return asyncio.run(judge(participant))
 
 
+def with_supervisors_numbers(seen: JudgedSystem) -> JudgedSystem:
+    """Return what was seen with what supervisors on this host measured, who compare clocks."""
+    numbers = [str(each) for each in seen.plan.bounds]
+    others = (
+        each.verdict
+        for each in (_supervisors(seen.plan) if numbers else ())
+        if each.verdict is not None and [str(one) for one in each.plan.bounds] == numbers
+    )
+    return replace(seen, verdict=with_measured(seen.verdict, others, seen.plan.policy))
+
+
 def follow_running(
     plan: Plan,
     on_change: Callable[[JudgedSystem], None],
@@ -198,27 +209,26 @@ def _looking(plan: Plan) -> ObserverParticipant:
     hosts = reached_hosts(plan, own_machines(plan, ""))
     os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
+    reported = (one for each in _supervisors(plan) for one in each.observation.configurations)
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
     return ObserverParticipant.open(
         plan.domain_id,
-        onlooker_connections(plan, _reported_to_supervisors(plan)),
+        onlooker_connections(plan, tuple(reported)),
         unplanned=is_open and is_negotiated(plan),
         settle_s=plan.discovery.settle_s,
     )
 
 
-def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
-    """Return what the supervisors of the system on this host know of its nodes."""
+def _supervisors(plan: Plan) -> Iterator[SupervisorSnapshot]:
+    """Yield what the supervisors of the system on this host know."""
     root = runtime_root(os.environ)
     wanted = run_name(plan, "")
-    found: list[NodeConfiguration] = []
     for name in running(root):
         if name == wanted or name.startswith(f"{wanted}."):
             # One that ends just now, or is too busy to answer, knows nothing that must be known.
             with contextlib.suppress(UsageError, TimeoutError):
-                found += look(root / name).observation.configurations
-    return tuple(found)
+                yield look(root / name)
 
 
 def _judged(

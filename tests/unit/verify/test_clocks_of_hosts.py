@@ -10,19 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import Machine, Policy, Quantity
+from lifecycle.manifest.model import EndpointKind, Machine, Policy, Quantity
 from lifecycle.measure.bounds import CLOCKS_S
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.delays import Delays, signed_buckets_of
 from lifecycle.measure.sample import Measured, Sample
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import apart_from_numbers, verify
+from lifecycle.verify.judge import apart_from_numbers, verify, with_measured
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.measured import compares_clocks, decided_by_clocks
 from lifecycle.verify.verdict import Stage, Verdict
-from tests.builders import at, link, node, planned, publisher, subscription
+from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import both, change_configuration
 from tests.unit.verify.perfect import perfect
 
@@ -192,6 +192,30 @@ def test_clocks_are_compared_where_a_delay_is_declared_and_data_pass_between_mac
     assert compares_clocks(system(name="five_qi", max_delay_ms=82))
     assert not compares_clocks(system(name="rate_hz"))
     assert not compares_clocks(system(viewer="robot"))
+
+
+@pytest.mark.parametrize("where", [None, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION])
+def test_what_a_supervisor_measured_is_taken_by_who_compares_no_clocks(
+    where: EndpointKind | None,
+) -> None:
+    number = (Quantity(name="max_delay_ms", value=2.0, at=at(40, 7)),)
+    needs = {where: [need(where, "/video", quantities=number)]} if where is not None else {}
+    made = publisher("/video"), subscription("/video")
+    plan = planned(
+        node("camera", made[0], needs=needs.get(made[0].kind, []), machine="robot"),
+        node("viewer", made[1], needs=needs.get(made[1].kind, []), machine="station"),
+        links=[link("/video", "camera", "viewer", quantities=() if needs else number)],
+        machines=tuple(Machine(name=each, at=at(2)) for each in ("robot", "station")),
+    )
+    alone = verify(plan, perfect(plan, Stage.ACTIVE), stage=Stage.ACTIVE)
+    assert [each.rule for each in alone.findings] == ["flow.not-measured"]
+    for delay_ms, rules in ((1.0, []), (50.0, ["flow.delay"])):
+        supervisors = judged(plan, robot(0.25), delay_ms=delay_ms)
+        both = with_measured(alone, [supervisors, judged(plan, own="robot")], plan.policy)
+        assert [each.rule for each in both.findings] == rules
+        assert (both.verdict, both.blocking) == (supervisors.verdict, supervisors.blocking)
+        assert both.measured == supervisors.measured
+    assert with_measured(alone, [], plan.policy) == alone
 
 
 WAY_NS = MS // 5
