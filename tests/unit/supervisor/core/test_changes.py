@@ -121,6 +121,12 @@ def test_what_became_active_on_the_way_back_and_is_wrong_is_named_and_stays_acti
     assert (play.levels, play.phase) == ("4 4", "active")
 
 
+def test_a_manifest_that_is_the_same_is_answered_and_nothing_is_asked() -> None:
+    play = Play(MORE)
+    assert play.order(APPLY, plan=MORE) == []
+    assert play.answers[0] == (0, "")
+
+
 @pytest.mark.parametrize("refuses", [False, True])
 def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(refuses: bool) -> None:
     plan = plan_of(CAMERA, rate(VIEWER, 2.0))
