@@ -27,7 +27,7 @@ from lifecycle.manifest.building import (
     positions_of,
     quantities,
 )
-from lifecycle.manifest.checks import check
+from lifecycle.manifest.checks.registry import check
 from lifecycle.manifest.diagnostics import (
     Diagnostic,
     ManifestError,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.checks import check
+from lifecycle.manifest.checks.registry import check
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,
