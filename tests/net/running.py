@@ -6,6 +6,7 @@ Owns: `article`, the example of *Unique Network Flows* on two machines, and `up_
 from __future__ import annotations
 
 import contextlib
+import copy
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -78,7 +79,7 @@ def article(
         place = document
         for key in parents:
             place = place.setdefault(key, {})
-        place[last] = value
+        place[last] = copy.deepcopy(value)  # another edit may be inside of it
     file = directory / "article.lifecycle.yaml"
     file.write_text(yaml.safe_dump(document))
     return file

@@ -339,8 +339,7 @@ def supervised_pictures(path: Path) -> Iterator[Picture]:
 
 
 def picture_of(seen: SupervisorSnapshot) -> Picture:
-    """Return what a supervisor sees."""
-    verdict = seen.verdict or verify(seen.plan, seen.observation, stage=Stage.ACTIVE)
+    """Return what a supervisor sees; before its first verdict the plan, and what nodes do."""
     supervised = {
         each.node: Supervised(
             pid=each.pid,
@@ -351,7 +350,7 @@ def picture_of(seen: SupervisorSnapshot) -> Picture:
         for each in seen.status.nodes
     }
     return build_picture(
-        seen.plan, seen.observation, verdict, phase=seen.status.phase, supervised=supervised
+        seen.plan, seen.observation, seen.verdict, phase=seen.status.phase, supervised=supervised
     )
 
 

@@ -7,6 +7,7 @@ processes that still carry a test's mark. Made for further suites to use.
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import os
 import queue
@@ -93,7 +94,7 @@ def pair(
         place = document
         for key in parents:
             place = place.setdefault(key, {})
-        place[last] = value
+        place[last] = copy.deepcopy(value)  # another edit may be inside of it
     file = directory / "pair.lifecycle.yaml"
     file.write_text(yaml.safe_dump(document))
     return file
