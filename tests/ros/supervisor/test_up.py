@@ -141,6 +141,9 @@ def test_a_plain_node_that_is_not_declared_as_one_is_named_with_the_key_that_men
         ), said
         shown = verb("status", "one", runtime=tmp_path).stdout
         assert "waiting for its lifecycle services" in shown
+        drawn = verb("graph", "one", runtime=tmp_path).stdout
+        assert "waiting for its lifecycle services" in drawn
+        assert "missing" not in drawn  # nobody has looked yet
         assert run.finish() == ExitCode.BRING_UP_FAILED
         assert "write 'managed: false' at nodes.plain" in run.verdict["findings"][0]["message"]
 
