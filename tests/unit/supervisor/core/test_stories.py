@@ -21,6 +21,7 @@ from lifecycle.manifest.model import (
 from lifecycle.plan.build import attached_to
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
@@ -250,6 +251,14 @@ def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, 
     play.see()
     play.wait(10.0)
     assert (play.code, play.reason) == (code, f"{why}: /intruder (graph.undeclared-node)")
+
+
+def test_who_needs_a_node_that_is_kept_inactive_is_kept_inactive_too() -> None:
+    play = Play(CHAIN, ways={"camera activate": "hang"})
+    camera, viewer = (play.run.nodes[key] for key in ("camera", "viewer"))
+    assert wanted(play.run, viewer) is Level.ACTIVE
+    camera.withheld, camera.request, play.run.passage = "a violation", None, None
+    assert wanted(play.run, viewer) is viewer.gate
 
 
 def test_a_violation_that_lasted_counts_also_where_nothing_is_to_be_activated() -> None:
