@@ -18,7 +18,7 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +36,9 @@ PROCESS_VARIABLE = "LIFECYCLE_PROCESS"
 """Set in every process of a run, with the name of the planned process that it descends from."""
 
 _OURS = os.O_CLOEXEC | os.O_NOFOLLOW
+
+_SERVICES = ("run/*/lifecycle", "run/user/*/lifecycle")
+"""Below /: `RuntimeDirectory=` of systemd.exec(5), and of users' own managers."""
 
 _LONGEST_RECORD = 16 * 2**20
 """Bytes; a record names processes, a few kB."""
@@ -119,6 +122,21 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
     if os.path.lexists(root):
         _refuse_unless_private(root)
     return root
+
+
+def run_roots(environment: Mapping[str, str]) -> tuple[Path, ...]:
+    """Return where a command looks for runs that it asks: runtime_root, and as root every service's.
+
+    A supervisor that systemd has started is another user (`DynamicUser=`), with a directory of its
+    own in /run. Root may ask it; a run of its own never uses such a directory.
+
+    Raises:
+        UsageError: as of runtime_root.
+    """
+    own = runtime_root(environment)
+    if os.getuid() != 0:
+        return (own,)
+    return (own, *sorted(each for of in _SERVICES for each in Path("/").glob(of) if each != own))
 
 
 def home_directory(environment: Mapping[str, str]) -> str:
@@ -430,48 +448,52 @@ def lost(path: Path) -> UsageError:
     )
 
 
-def left_behind(root: Path) -> tuple[str, ...]:
-    """Return the names of all runs whose supervisor was killed, sorted."""
-    if not root.is_dir():
-        return ()
-    paths = sorted(root.iterdir())
-    return tuple(each.name for each in paths if not is_held(each) and read_record(each) is not None)
+def left_behind(*roots: Path) -> tuple[Path, ...]:
+    """Return the directories of all runs whose supervisor was killed, sorted by name."""
+    return tuple(each for each in _all(roots) if not is_held(each) and read_record(each))
 
 
-def running(root: Path) -> tuple[str, ...]:
-    """Return the names of all runs that a supervisor holds, sorted."""
-    if not root.is_dir():
-        return ()
-    return tuple(sorted(entry.name for entry in root.iterdir() if is_held(entry)))
+def running(*roots: Path) -> tuple[Path, ...]:
+    """Return the directories of all runs that a supervisor holds, sorted by name."""
+    return tuple(each for each in _all(roots) if is_held(each))
 
 
-def find_run(root: Path, word: str) -> Path:
+def _all(roots: Iterable[Path]) -> list[Path]:
+    found = (each for root in roots if root.is_dir() for each in root.iterdir())
+    return sorted(found, key=lambda path: path.name)
+
+
+def find_run(roots: Iterable[Path], word: str) -> Path:
     """Return the directory of the run that `word` means.
 
     Args:
-        root: see runtime_root.
+        roots: see run_roots.
         word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
 
     Raises:
         UsageError: no such run, or more than one.
     """
-    names = running(root)
-    found = [name for name in names if word in (name, name.rpartition("@")[0])]
+    roots = tuple(roots)
+    runs = running(*roots)
+    found = [each for each in runs if _is_named(each, word)]
     if len(found) == 1:
-        return root / found[0]
+        return found[0]
     if found:
-        raise UsageError(f"cannot tell which {word!r} is meant; running: {', '.join(found)}")
-    left = [
-        entry.name
-        for entry in (root.iterdir() if root.is_dir() else ())
-        if word in (entry.name, entry.name.rpartition("@")[0]) and read_record(entry) is not None
-    ]
-    if left:
-        return root / left[0]
+        names = [each.name for each in found]
+        what = names if len(set(names)) > 1 else map(str, found)
+        raise UsageError(f"cannot tell which {word!r} is meant; running: {', '.join(what)}")
+    for each in left_behind(*roots):
+        if _is_named(each, word):
+            return each
     raise UsageError(
-        f"cannot find a running system {word!r}; running: {', '.join(names) or 'none'}",
+        f"cannot find a running system {word!r}; "
+        f"running: {', '.join(each.name for each in runs) or 'none'}",
         hint="start it: lifecycle up MANIFEST",
     )
+
+
+def _is_named(path: Path, word: str) -> bool:
+    return word in (path.name, path.name.rpartition("@")[0])
 
 
 @contextlib.contextmanager

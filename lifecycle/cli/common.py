@@ -324,18 +324,18 @@ def target_plan(
         UsageError: no such run, or arguments for a system that is named.
         ManifestError: the manifest cannot be loaded.
     """
-    from lifecycle.run_directory import find_run, run_name, runtime_root
+    from lifecycle.run_directory import find_run, run_name, run_roots
 
-    root = runtime_root(environment)
+    roots = run_roots(environment)
     if not is_manifest(target):
         if assignments:
             raise UsageError(
                 f"cannot use {' '.join(assignments)} with the running system {target!r}",
                 hint="arguments belong to a manifest; name its file",
             )
-        return find_run(root, target), None
+        return find_run(roots, target), None
     plan = load_plan(target, assignments, quiet=True)
-    return find_run(root, run_name(plan, machine)), plan
+    return find_run(roots, run_name(plan, machine)), plan
 
 
 def network_options(flag: str, help_: str) -> Callable[[F], F]:

@@ -47,9 +47,9 @@ def _manifests(_: click.Context) -> Iterable[str]:
 
 
 def _systems(_: click.Context) -> Iterable[str]:
-    from lifecycle.run_directory import running, runtime_root
+    from lifecycle.run_directory import run_roots, running
 
-    return running(runtime_root(os.environ))
+    return [each.name for each in running(*run_roots(os.environ))]
 
 
 def _runs(_: click.Context) -> Iterable[str]:

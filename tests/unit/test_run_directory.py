@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from lifecycle import run_directory
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.run_directory import (
@@ -25,6 +26,7 @@ from lifecycle.run_directory import (
     find_run,
     read_record,
     run_name,
+    run_roots,
     running,
     runtime_root,
     short_path,
@@ -210,13 +212,13 @@ def test_a_run_is_named_by_system_domain_and_machine() -> None:
 
 def test_a_word_finds_its_run_or_says_what_runs(tmp_path: Path) -> None:
     held = [RunDirectory.acquire(tmp_path, name, "abc") for name in ("arm@1", "arm@2", "base@1")]
-    assert running(tmp_path) == ("arm@1", "arm@2", "base@1")
-    assert find_run(tmp_path, "base") == tmp_path / "base@1"
-    assert find_run(tmp_path, "arm@2") == tmp_path / "arm@2"
+    assert [each.name for each in running(tmp_path)] == ["arm@1", "arm@2", "base@1"]
+    assert find_run([tmp_path], "base") == tmp_path / "base@1"
+    assert find_run([tmp_path], "arm@2") == tmp_path / "arm@2"
     with pytest.raises(UsageError, match="cannot tell which 'arm' is meant; running: arm@1, arm@2"):
-        find_run(tmp_path, "arm")
+        find_run([tmp_path], "arm")
     with pytest.raises(UsageError) as caught:
-        find_run(tmp_path, "leg")
+        find_run([tmp_path], "leg")
     assert str(caught.value) == (
         "cannot find a running system 'leg'; running: arm@1, arm@2, base@1; "
         "start it: lifecycle up MANIFEST"
@@ -224,6 +226,28 @@ def test_a_word_finds_its_run_or_says_what_runs(tmp_path: Path) -> None:
     for each in held:
         each.release()
     assert running(tmp_path) == ()
+
+
+def test_root_asks_the_runs_of_services_and_uses_none_of_their_directories(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd starts a supervisor as a user of its own, in a directory of its own."""
+    monkeypatch.setattr(run_directory, "_SERVICES", (f"{tmp_path}/*/lifecycle".lstrip("/"),))
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    (tmp_path / "mine").mkdir(mode=0o700)
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path / "mine")}
+    services = [tmp_path / name / "lifecycle" for name in ("arm", "leg")]
+    held = [RunDirectory.acquire(root, f"{root.parent.name}@1", "abc") for root in services]
+    also = RunDirectory.acquire(runtime_root(environment), "arm@1", "abc")
+    roots = run_roots(environment)
+    assert roots == (tmp_path / "mine/lifecycle", *services)
+    assert find_run(roots, "leg") == services[1] / "leg@1"
+    with pytest.raises(UsageError, match=f"running: {tmp_path}/mine/lifecycle/arm@1, {tmp_path}"):
+        find_run(roots, "arm")  # of the same name in two places: said by their places
+    for each in (*held, also):
+        each.release()
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    assert run_roots({"XDG_RUNTIME_DIR": "/no/such"}) == (Path("/tmp/lifecycle-12345"),)
 
 
 def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(

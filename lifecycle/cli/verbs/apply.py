@@ -143,14 +143,14 @@ def _run_of(plan: Plan, machine: str) -> Path:
     Raises:
         UsageError: nothing of this name runs in its domain.
     """
-    from lifecycle.run_directory import find_run, run_name, running, runtime_root
+    from lifecycle.run_directory import find_run, run_name, run_roots, running
 
-    root = runtime_root(os.environ)
+    roots = run_roots(os.environ)
     name = run_name(plan, machine)
     try:
-        return find_run(root, name)
+        return find_run(roots, name)
     except UsageError:
-        others = [each for each in running(root) if _is_by(root / each, plan)]
+        others = [each.name for each in running(*roots) if _is_by(each, plan)]
         if len(others) != 1:
             raise
     raise UsageError(

@@ -187,18 +187,18 @@ def _watch(path: Path, format_: str) -> int:
 
 
 def _list_running(format_: str) -> int:
-    from lifecycle.run_directory import left_behind, lost, running, runtime_root
+    from lifecycle.run_directory import left_behind, lost, run_roots, running
 
-    root = runtime_root(os.environ)
-    names = running(root)
+    roots = run_roots(os.environ)
+    names = [each.name for each in running(*roots)]
     if format_ == "json":
         from lifecycle.codec import to_json
 
         click.echo(to_json(names).decode())
     else:
         click.echo("\n".join(names) or "no system runs")
-        for name in left_behind(root):
-            click.echo(lines(str(lost(root / name))), err=True)
+        for each in left_behind(*roots):
+            click.echo(lines(str(lost(each))), err=True)
     return ExitCode.OK
 
 

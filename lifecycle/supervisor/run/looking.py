@@ -30,7 +30,7 @@ from lifecycle.middleware.process.control import check_memory
 from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan
-from lifecycle.run_directory import is_held, run_name, running, runtime_root
+from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
@@ -222,13 +222,12 @@ def _looking(plan: Plan) -> ObserverParticipant:
 
 def _supervisors(plan: Plan) -> Iterator[SupervisorSnapshot]:
     """Yield what the supervisors of the system on this host know."""
-    root = runtime_root(os.environ)
     wanted = run_name(plan, "")
-    for name in running(root):
-        if name == wanted or name.startswith(f"{wanted}."):
+    for path in running(*run_roots(os.environ)):
+        if path.name == wanted or path.name.startswith(f"{wanted}."):
             # One that ends just now, or is too busy to answer, knows nothing that must be known.
             with contextlib.suppress(UsageError, TimeoutError):
-                yield look(root / name)
+                yield look(path)
 
 
 def _judged(
