@@ -19,7 +19,7 @@ help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
 	@echo "make test    set up and run the tests, real DDS included; no privilege needed; five minutes"
 	@echo "make test-kilted  try the verbs on ROS 2 Kilted, in a venv of its own; two minutes"
-	@echo "make test-engines  run the pods of an exported system with podman; three minutes"
+	@echo "make test-engines  have podman and systemd run an exported system; three minutes"
 	@echo "make outside try the promise from outside: every attack, the nine systems, ros2 clients, faults; eight minutes."
 	@echo "             LIFECYCLE=path/to/lifecycle make outside asks another installation"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
@@ -51,7 +51,7 @@ test: $(STAMP)
 test-thorough: $(STAMP)
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m thorough tests/unit
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/ros tests/net tests/outside
-	$(PYTEST) -m alone tests/ros tests/net
+	$(PYTEST) -m alone tests/ros tests/net tests/engines
 
 # The same tests on the other distribution: what is asked, and what asks, run on it.
 KILTED    := $(VENV)-kilted

@@ -18,7 +18,7 @@ import msgspec
 import yaml
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Restart, Timeouts
+from lifecycle.manifest.model import Resources, Restart, Timeouts
 from lifecycle.manifest.shared import THIS_HOST
 from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
@@ -105,6 +105,12 @@ class Deployment(msgspec.Struct, frozen=True, kw_only=True):
             if each.machine == machine or not machine
         )
 
+    def limited(self, machine: str) -> Iterator[tuple[str, Resources]]:
+        """Yield a machine's processes that systemd is to limit, by name, and what they may use."""
+        for each in self.plan.processes:
+            if each.run.resources is not None and machine in ("", each.machine):
+                yield each.name, each.run.resources
+
     def probe(self, what: str) -> tuple[str, ...]:
         """Return the command that says, in a container, whether it is "live" or "ready"."""
         return ("lifecycle", "status", run_name(self.plan).rpartition("@")[0], "--probe", what)
@@ -162,7 +168,8 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("StateDirectory", name),
         ("Environment", f"XDG_RUNTIME_DIR=%t/{name}"),
         ("Environment", f"ROS_HOME=%S/{name}"),
-        ("DynamicUser", "yes"),
+        # Root alone may have systemd limit what it starts: here it is root without a capability.
+        *([] if any(deployment.limited(machine)) else [("DynamicUser", "yes")]),
         ("NoNewPrivileges", "yes"),
         ("ProtectSystem", "strict"),
         ("ProtectHome", "read-only"),
@@ -206,16 +213,13 @@ def _refuse_resources(deployment: Deployment, machine: str) -> None:
     Raises:
         UsageError: it is to.
     """
-    for process in deployment.plan.processes:
-        here = process.machine == machine or not machine
-        if here and process.run.resources is not None:
-            raise UsageError(
-                f"{process.run.resources.at.spelled}: cannot give process {process.name!r} its "
-                "'run.resources' in a container of Kubernetes: systemd limits what a process may "
-                "use, and does not run there",
-                hint="leave 'resources' out and limit the whole container (resources.limits), or "
-                "write a unit: lifecycle export systemd",
-            )
+    for name, resources in deployment.limited(machine):
+        raise UsageError(
+            f"{resources.at.spelled}: cannot give process {name!r} its 'run.resources' in a "
+            "container of Kubernetes: systemd limits what a process may use, and does not run there",
+            hint="leave 'resources' out and limit the whole container (resources.limits), or write "
+            "a unit: lifecycle export systemd",
+        )
 
 
 _ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the container's own

@@ -1,9 +1,8 @@
 """Units of two machines, as `lifecycle export systemd` writes them, started by systemd itself.
 
-Each machine is a network namespace with a user manager of systemd in a mount namespace of its own:
-it starts, watches, restarts and stops services as the manager of a machine does. What only that one
-can do, DynamicUser= and the capabilities, is read by `systemd-analyze verify` in
-tests/unit/export/test_engines.py.
+Each machine is a network namespace with a manager of systemd in a mount namespace of its own. It is
+a user manager, of root and with its sockets where a machine's are: it starts, watches, restarts and
+stops services as that does, DynamicUser= included, without being the first process of anything.
 """
 
 from __future__ import annotations
@@ -24,12 +23,15 @@ import pytest
 import yaml
 
 from tests.net.hosts import Host, Hosts, lacking
+from tests.second_try import SECOND_TRY
 
 ROOT = Path(__file__).parents[2]
 SYSTEMD = Path("/lib/systemd/systemd")
 MACHINES = ("robot", "operator")
 pytestmark = [
+    SECOND_TRY,
     pytest.mark.thorough,
+    pytest.mark.alone,
     pytest.mark.timeout(200),
     pytest.mark.skipif(
         bool(lacking()) or not SYSTEMD.exists(),
@@ -40,12 +42,12 @@ pytestmark = [
 _BOOT = """
 mount --make-rprivate / &&
 mount -t tmpfs tmpfs /run && mount -t tmpfs tmpfs /dev/shm &&
-mkdir -p /run/systemd/system /run/units && mkdir /run/user &&
+mkdir -p /run/systemd/system /run/units &&
 printf '[Unit]\\nDefaultDependencies=no\\n' > /run/units/basic.target &&
 mkdir /run/home && mount --bind /root /run/home && mount -t tmpfs -o mode=755 tmpfs /root &&
 for each in $FROM_HOME; do mkdir /root/$each && mount --bind /run/home/$each /root/$each || exit; done &&
 for each in $GROUPS_; do mkdir $each && echo $$ > $each/cgroup.procs || exit; done &&
-exec env -i PATH="$PATH" XDG_RUNTIME_DIR=/run/user SYSTEMD_UNIT_PATH=/run/units \
+exec env -i PATH="$PATH" XDG_RUNTIME_DIR=/run SYSTEMD_UNIT_PATH=/run/units \
     $SYSTEMD --user --unit=basic.target --log-target=null
 """
 """A user manager runs only where systemd has booted, which it knows by /run/systemd/system. Who a
@@ -89,7 +91,7 @@ class Machine:
         )
         within(10, lambda: self.systemctl("is-system-running", check=False) == "running")
         # As that of a machine's manager: whoever a service runs as may write to it.
-        subprocess.run(self.command("chmod", "a+w", "/run/user/systemd/notify"), check=True)
+        subprocess.run(self.command("chmod", "a+w", "/run/systemd/notify"), check=True)
 
     def close(self) -> None:
         """Wait for the manager, whose host has ended, and remove its control groups."""
@@ -102,7 +104,7 @@ class Machine:
     def command(self, *words: str) -> list[str]:
         """Return the command line that runs `words` there."""
         enter = ("nsenter", "-t", str(self._manager.pid), "-n", "-m", "--")
-        return [*enter, "env", "XDG_RUNTIME_DIR=/run/user", *words]
+        return [*enter, *words]
 
     def copy(self, source: Path, target: str) -> None:
         """Copy a file or a folder to that machine."""
@@ -112,7 +114,7 @@ class Machine:
     def systemctl(self, *words: str, check: bool = True) -> str:
         """Return what systemctl(1) says."""
         done = subprocess.run(
-            self.command("systemctl", "--user", *words),
+            self.command("systemctl", *words),
             capture_output=True,
             text=True,
             check=False,
@@ -123,7 +125,7 @@ class Machine:
 
     def begin_start(self) -> subprocess.Popen[bytes]:
         """Start the unit, as `systemctl start` does, which returns once it is ready."""
-        return subprocess.Popen(self.command("systemctl", "--user", "start", self.unit))
+        return subprocess.Popen(self.command("systemctl", "start", self.unit))
 
     def show(self, name: str) -> str:
         """Return a property of the unit."""
@@ -164,6 +166,7 @@ def machines(tmp_path: Path, lifecycle_domain: int) -> Iterator[tuple[Machine, M
         manifest["restart"] = "on-failure"
         manifest["nodes"]["talker"]["machine"] = "robot"
         manifest["nodes"]["listener"]["machine"] = "operator"
+        manifest["nodes"]["listener"]["run"]["resources"] = {"tasks_max": 321}
         system = tmp_path / "system"
         shutil.copytree(ROOT / "examples/first_node", system / "examples/first_node")
         (system / "units.lifecycle.yaml").write_text(yaml.safe_dump(manifest))
@@ -205,6 +208,11 @@ def test_two_units_are_one_system_and_start_returns_once_it_is_verified_and_acti
     for machine in machines:
         status = machine.status()
         assert (status["phase"], status["verdict"]) == ("active", "ok")
+
+    # What a process may use is limited by systemd, in a scope that the supervisor ends.
+    (listener,) = operator.status()["nodes"]
+    scope = Path(f"/proc/{listener['pid']}/cgroup").read_text().split("/")[-1].strip()
+    assert operator.systemctl("show", "--value", "-p", "TasksMax", scope) == "321"
 
     # A node that is killed is restarted by its supervisor, and the unit goes on.
     (talker,) = (each for each in robot.status()["nodes"] if each["node"] == "/talker")

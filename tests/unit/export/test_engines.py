@@ -142,6 +142,20 @@ def test_a_container_in_which_nothing_limits_processes_is_refused(tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
+def test_a_unit_whose_processes_systemd_limits_runs_as_root_which_alone_may_ask_for_it(
+    tmp_path: Path,
+) -> None:
+    manifest = tmp_path / "limited.lifecycle.yaml"
+    manifest.write_text(LIMITED)
+    exported(tmp_path / "out", "systemd", str(manifest))
+    here, there = (
+        (tmp_path / f"out/limited-{each}.service").read_text() for each in ("here", "there")
+    )
+    assert "DynamicUser" not in here
+    assert "CapabilityBoundingSet=\n" in here
+    assert "DynamicUser=yes\n" in there
+
+
 AWKWARD = """
 manifest_version: 1
 system: The_Longest-System_Name_That_Anybody_Would_Write_In_A_Manifest_Of_Theirs
