@@ -125,7 +125,7 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
 
 
 def run_roots(environment: Mapping[str, str]) -> tuple[Path, ...]:
-    """Return where a command looks for runs that it asks: runtime_root, and as root every service's.
+    """Return where a command looks for runs that it asks: runtime_root, as root every service's.
 
     A supervisor that systemd has started is another user (`DynamicUser=`), with a directory of its
     own in /run. Root may ask it; a run of its own never uses such a directory.

@@ -216,7 +216,8 @@ def _refuse_resources(deployment: Deployment, machine: str) -> None:
     for name, resources in deployment.limited(machine):
         raise UsageError(
             f"{resources.at.spelled}: cannot give process {name!r} its 'run.resources' in a "
-            "container of Kubernetes: systemd limits what a process may use, and does not run there",
+            "container of Kubernetes: systemd limits what a process may use, "
+            "and does not run there",
             hint="leave 'resources' out and limit the whole container (resources.limits), or write "
             "a unit: lifecycle export systemd",
         )

@@ -45,7 +45,9 @@ mount -t tmpfs tmpfs /run && mount -t tmpfs tmpfs /dev/shm &&
 mkdir -p /run/systemd/system /run/units &&
 printf '[Unit]\\nDefaultDependencies=no\\n' > /run/units/basic.target &&
 mkdir /run/home && mount --bind /root /run/home && mount -t tmpfs -o mode=755 tmpfs /root &&
-for each in $FROM_HOME; do mkdir /root/$each && mount --bind /run/home/$each /root/$each || exit; done &&
+for each in $FROM_HOME; do
+    mkdir /root/$each && mount --bind /run/home/$each /root/$each || exit
+done &&
 for each in $GROUPS_; do mkdir $each && echo $$ > $each/cgroup.procs || exit; done &&
 exec env -i PATH="$PATH" XDG_RUNTIME_DIR=/run SYSTEMD_UNIT_PATH=/run/units \
     $SYSTEMD --user --unit=basic.target --log-target=null
@@ -55,7 +57,7 @@ service runs as may not enter /root, where the interpreter may be."""
 
 
 def _groups(name: str) -> list[Path]:
-    """Return the control groups that a manager of that name gets, one for each of its hierarchies."""
+    """Return the control groups that a manager of that name gets, one a hierarchy."""
     found = []
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
@@ -123,9 +125,9 @@ class Machine:
         assert not check or done.returncode == 0, done.stdout + done.stderr
         return done.stdout.strip()
 
-    def begin_start(self) -> subprocess.Popen[bytes]:
-        """Start the unit, as `systemctl start` does, which returns once it is ready."""
-        return subprocess.Popen(self.command("systemctl", "start", self.unit))
+    def begin(self, verb: str) -> subprocess.Popen[bytes]:
+        """Begin `systemctl start`, which ends once the unit is ready, or `stop`."""
+        return subprocess.Popen(self.command("systemctl", verb, self.unit))
 
     def show(self, name: str) -> str:
         """Return a property of the unit."""
@@ -195,24 +197,41 @@ def machines(tmp_path: Path, lifecycle_domain: int) -> Iterator[tuple[Machine, M
         yield made[0], made[1]
 
 
-def test_two_units_are_one_system_and_start_returns_once_it_is_verified_and_active(
-    machines: tuple[Machine, Machine],
-) -> None:
-    robot, operator = machines
-    first = robot.begin_start()
+def start(machines: tuple[Machine, Machine]) -> None:
+    """Start both, and wait until both are ready."""
+    first = machines[0].begin("start")
     time.sleep(2)
-    assert first.poll() is None, robot.systemctl("status", "--no-pager", robot.unit, check=False)
-    assert robot.show("ActiveState") == "activating"
-    assert operator.begin_start().wait(60) == 0
+    assert first.poll() is None, "a machine alone is no verified system"
+    assert machines[0].show("ActiveState") == "activating"
+    assert machines[1].begin("start").wait(60) == 0
     assert first.wait(10) == 0
     for machine in machines:
         status = machine.status()
         assert (status["phase"], status["verdict"]) == ("active", "ok")
 
+
+def stop(machines: tuple[Machine, Machine]) -> set[str]:
+    """Stop both at once, so that none goes on without the other; return what they ended with."""
+    ends = [machine.begin("stop") for machine in machines]
+    assert [end.wait(60) for end in ends] == [0, 0]
+    for machine in machines:
+        assert machine.show("TasksCurrent") in ("[not set]", "0")
+        assert not machine.systemctl("list-units", "--no-legend", "--type=scope", "run-*")
+    return {machine.show("Result") for machine in machines}
+
+
+def test_two_units_are_one_system_and_start_returns_once_it_is_verified_and_active(
+    machines: tuple[Machine, Machine],
+) -> None:
+    robot, operator = machines
+    start(machines)
     # What a process may use is limited by systemd, in a scope that the supervisor ends.
     (listener,) = operator.status()["nodes"]
     scope = Path(f"/proc/{listener['pid']}/cgroup").read_text().split("/")[-1].strip()
     assert operator.systemctl("show", "--value", "-p", "TasksMax", scope) == "321"
+
+    assert stop(machines) == {"success"}
+    start(machines)
 
     # A node that is killed is restarted by its supervisor, and the unit goes on.
     (talker,) = (each for each in robot.status()["nodes"] if each["node"] == "/talker")
@@ -226,8 +245,4 @@ def test_two_units_are_one_system_and_start_returns_once_it_is_verified_and_acti
     within(60, lambda: robot.show("ActiveState") == "active")
     assert operator.show("NRestarts") == "0"
 
-    for machine in machines:
-        machine.systemctl("stop", machine.unit)
-        assert machine.show("Result") == "success"
-        assert machine.show("ActiveState") == "inactive"
-        assert machine.show("TasksCurrent") in ("[not set]", "0")
+    stop(machines)
