@@ -69,3 +69,14 @@ def test_a_clean_environment_without_ros_checks_and_plans(released: Path, tmp_pa
     manifest = "manifests/my_robot.lifecycle.yaml"
     assert "ok" in _run(program, "check", manifest, cwd=tmp_path / "my_robot")
     assert "/talker" in _run(program, "plan", manifest, cwd=tmp_path / "my_robot")
+
+
+def test_pipx_runs_it_without_installing_anything(released: Path, tmp_path: Path) -> None:
+    (wheel,) = released.glob("*.whl")
+    _run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
+    python = tmp_path / "venv/bin/python"
+    _run(python, "-m", "pip", "install", "--quiet", "pipx", cwd=tmp_path)
+    homes = {each: str(tmp_path / each.lower()) for each in ("PIPX_HOME", "PIPX_BIN_DIR")}
+    pipx = ("env", *(f"{name}={path}" for name, path in homes.items()), python, "-m", "pipx")
+    ran = _run(*pipx, "run", "--spec", wheel, "lifecycle", "--version", cwd=tmp_path)
+    assert wheel.name.split("-")[1] in ran
