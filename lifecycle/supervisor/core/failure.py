@@ -498,5 +498,8 @@ def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
     if run.passage is not None:
-        run.passage.until_s = NEVER_S if run.failures else run.now_s + limit_s
+        again_s = max(
+            run.passage.until_s, run.now_s + limit_s
+        )  # what is started again may be due later
+        run.passage.until_s = NEVER_S if run.failures else again_s
     return events
