@@ -8,9 +8,17 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Restart, RunKind, Supervision
+from lifecycle.manifest.model import (
+    EndpointKind,
+    OnFailure,
+    Quantity,
+    Restart,
+    RunKind,
+    Supervision,
+)
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core.failure import ALSO_S
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.run.events import (
     GateOpened,
@@ -19,8 +27,8 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     VerdictChanged,
 )
-from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.core.playbook import CHAIN, INTRUDER, Play, chain
+from tests.builders import HERE, plan_of, planned_endpoint, planned_node
+from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, INTRUDER, Play, chain
 from tests.unit.supervisor.core.world import measured
 
 
@@ -109,3 +117,89 @@ def test_a_paused_system_that_is_taken_through_its_gate_in_vain_is_paused_still(
     play.finish("viewer activate")
     assert play.phase == "paused"
     assert [code for code, _ in play.answers.values()] == [ExitCode.OK, ExitCode.VIOLATED]
+
+
+def test_what_comes_back_to_a_gate_that_is_closed_is_judged_from_then() -> None:
+    play = Play(chain())
+    play.see(INTRUDER)
+    play.wait(5.0)
+    play.die("viewer")
+    play.wait(1.1)  # it is started again after a second
+    closed = "cannot activate"
+    assert [each for each in play.heard(Notice) if each.message.startswith(closed)] == []
+    play.wait(1.0)
+    assert len([each for each in play.heard(Notice) if each.message.startswith(closed)]) == 1
+
+
+def test_who_is_at_the_gate_while_the_run_fails_is_not_let_through() -> None:
+    play = Play(plan_of(planned_node("a"), planned_node("b")), ways={"look": "hang"})
+    play.die("a")
+    play.held.pop()
+    play.give(inputs.Verified(mark=play.run.mark, verdict=play.found))
+    play.wait(ALSO_S)
+    assert play.run.ending is not None
+    assert "b activate" not in play.story
+    assert play.heard(GateOpened) == []
+
+
+def test_a_plain_process_that_is_started_again_opens_no_gate_for_anybody() -> None:
+    plain = planned_node("log", kind=RunKind.COMMAND, managed=False, supervision=AGAIN)
+    play = Play(plan_of(planned_node("camera"), plain))
+    play.die("log", 1)
+    play.wait(2.0)
+    assert len(play.heard(RestartScheduled)) == 1
+    assert [each.nodes for each in play.heard(GateOpened)] == [("/camera",)]
+
+
+def test_a_component_is_loaded_once_its_container_is_there() -> None:
+    part = planned_node("part", kind=RunKind.COMMAND, process="")
+    run = replace(part.run, component="parts/Part", container="host")
+    host = planned_node("host", kind=RunKind.COMMAND, managed=False)
+    play = Play(plan_of(host, replace(part, run=run)), ways={"host start": "hang"})
+    assert play.story == ["spawn host", "host start"]
+    assert "part start" in play.finish("host start")
+
+
+def test_no_node_is_wired_before_those_are_configured_that_come_early() -> None:
+    hang = {"a configure": "hang", "b configure": "hang"}
+    play = Play(plan_of(planned_node("a"), planned_node("b")), ways=hang, wires=True)
+    play.run.early = frozenset({"b"})
+    assert "a wire" not in play.finish("a configure")
+    assert "a wire" in play.finish("b configure")
+
+
+def test_what_goes_down_with_two_that_failed_is_started_again_after_the_longer_time() -> None:
+    alone = Supervision(restart=Restart.ON_FAILURE, restart_sec=5.0)
+    every = replace(alone, restart_sec=1.0, on_failure=OnFailure.ALL)
+    play = Play(plan_of(planned_node("a", supervision=alone), planned_node("b", supervision=every)))
+    play.die("a")
+    play.wait(0.5)
+    play.die("b")
+    assert {"spawn a", "spawn b"} & {*play.wait(4.0)} == {"spawn b"}
+    assert "spawn a" in play.wait(1.0)
+
+
+def test_how_often_others_activated_a_node_is_forgotten_once_it_passed_the_gate() -> None:
+    play = Play(plan_of(planned_node("arm", managed=True, kind=RunKind.COMMAND)))
+    for _ in range(2):
+        play.order(ControlRequest.PAUSE)
+        for _ in range(3):
+            play.give(inputs.Saw(levels={"arm": Level.ACTIVE}))
+            assert play.levels == str(int(Level.CONNECTED))
+        play.order(ControlRequest.RESUME)
+    assert [code for code, _ in play.answers.values()] == [ExitCode.OK] * 4
+
+
+def test_a_number_is_measured_for_ten_seconds_also_where_no_look_ends() -> None:
+    rate = (Quantity(name="rate_hz", value=9, at=HERE),)
+    data = planned_endpoint(EndpointKind.PUBLISHER, "data", quantities=rate)
+    play = Play(plan_of(replace(planned_node("a"), endpoints=(data,))), ways={"a activate": "hang"})
+    play.ways["look"] = "hang"
+    play.finish("a activate")
+    play.give(inputs.Verified(mark=play.held.pop().mark, verdict=play.found))
+    phases = []
+    for _ in range(12):
+        play.wait(1.0)
+        phases.append(play.phase)
+    assert set(phases[:9]) == {"measuring"}
+    assert set(phases[10:]) == {"active"}
