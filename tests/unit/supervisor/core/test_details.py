@@ -110,11 +110,15 @@ def test_a_node_that_others_activate_is_deactivated_and_after_three_times_left(t
 def test_a_paused_system_that_is_taken_through_its_gate_in_vain_is_paused_still() -> None:
     play = Play(CHAIN)
     play.order(ControlRequest.PAUSE)
-    play.ways["viewer activate"] = "hang"
+    play.ways |= {"viewer activate": "hang", "camera deactivate": "hang"}
     play.order(ControlRequest.RESUME)
     play.see(INTRUDER)
     play.wait(5.0)
     play.finish("viewer activate")
+    play.wait(1.0)  # camera is active still, and nobody but us had it activated
+    assert play.run.judged.verdict is not None
+    assert {each.rule for each in play.run.judged.verdict.findings} == {INTRUDER[0]}
+    play.finish("camera deactivate")
     assert play.phase == "paused"
     assert [code for code, _ in play.answers.values()] == [ExitCode.OK, ExitCode.VIOLATED]
 
