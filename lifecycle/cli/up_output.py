@@ -1,4 +1,4 @@
-"""Output of `lifecycle up`: JSON lines, plain lines, or a live table on a terminal.
+"""Output of `lifecycle up`: JSON lines, plain lines, or a live view on a terminal.
 
 Owns: the choice between them and the two line formats. Everything comes from the supervisor's
 events.
