@@ -195,11 +195,6 @@ class Programmer(Removal):
         with self._ledger.locked():
             return tuple(each.plan(rules) for each in self._targets)
 
-    def dry_run(self, flows: Iterable[FlowReport]) -> str:
-        """Return what `update` would send if nothing were there."""
-        rules = self.rules(flows).rules
-        return "\n".join(each.dry_run(rules) for each in self._targets)
-
     def update(
         self,
         flows: Iterable[FlowReport],

@@ -195,10 +195,6 @@ class Target(abc.ABC):
     def remove(self) -> TargetChanges:
         """Delete everything of ours."""
 
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return what would be sent if nothing were there; changes nothing."""
-        return self.export(self._settings, RuleSet(rules=tuple(rules)), self._ledger.system)
-
     def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
         return None

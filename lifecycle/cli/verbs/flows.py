@@ -1,6 +1,6 @@
 """`lifecycle flows`: show every network flow, how unique it is and what was measured of it.
 
-Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply`, `diff` and
+Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply` and
 `remove`. Exported texts and what is done to networks are programming's.
 """
 
@@ -21,7 +21,6 @@ from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import (
     NETWORKS,
-    F,
     asking,
     assignments_argument,
     export_option,
@@ -218,7 +217,7 @@ class _ShowsByDefault(click.Group):
 @click.group(
     "flows",
     cls=_ShowsByDefault,
-    subcommand_metavar="TARGET [NAME:=VALUE]... | apply|diff|remove MANIFEST ...",
+    subcommand_metavar="TARGET [NAME:=VALUE]... | apply|remove MANIFEST ...",
 )
 def command() -> None:
     """Show every publisher → subscription pair of a running system.
@@ -402,41 +401,24 @@ def apply(
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
+
+    Returns:
+        VIOLATED of a dry run if a network is not as the verified flows want it.
     """
     from lifecycle.programming.target import PartlyError
 
     programmer = _open(plan, options, treatment)
-    if dry_run:
-        click.echo(programmer.dry_run(flows), nl=False)
-    else:
-        try:
-            _show_changes(programmer.update(flows), done=True)
-        except PartlyError as error:
-            if error.done:
-                path = shlex.quote(plan.manifest_path)
-                error.hint = f"take back what was done: lifecycle flows remove {path}"
-            raise
+    try:
+        changes = programmer.diff(flows) if dry_run else programmer.update(flows)
+    except PartlyError as error:
+        if error.done:
+            path = shlex.quote(plan.manifest_path)
+            error.hint = f"take back what was done: lifecycle flows remove {path}"
+        raise
+    _show_changes(changes, done=not dry_run)
     _show_left_out(programmer.left_out)
-    return ExitCode.OK
-
-
-def diff(
-    plan: Plan,
-    flows: Sequence[FlowReport],
-    options: Sequence[Chosen],
-    *,
-    treatment: Treatment | None = None,
-) -> int:
-    """Say what `apply` would do.
-
-    Returns:
-        VIOLATED if a network is not as the verified flows want it.
-    """
-    programmer = _open(plan, options, treatment)
-    changes = programmer.diff(flows)
-    _show_changes(changes, done=False)
-    _show_left_out(programmer.left_out)
-    return ExitCode.VIOLATED if any(each.pending for each in changes) else ExitCode.OK
+    differs = dry_run and any(each.pending for each in changes)
+    return ExitCode.VIOLATED if differs else ExitCode.OK
 
 
 def remove(plan: Plan) -> int:
@@ -449,17 +431,11 @@ def remove(plan: Plan) -> int:
     return ExitCode.OK
 
 
-def _programming(function: F) -> F:
-    """Add what the subcommands that program networks take."""
-    function = network_options("--target", "Network to program; may be given several times.")(
-        _timeout(function)
-    )
-    return manifest_arguments(function)
-
-
 @command.command("apply")
-@_programming
-@click.option("--dry-run", is_flag=True, help="Print what would be sent.")
+@manifest_arguments
+@network_options("--target", "Network to program; may be given several times.")
+@click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
+@_timeout
 def _apply(
     *,
     manifest: str,
@@ -473,27 +449,15 @@ def _apply(
 
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     """
-    options, treatment = _read(targets, rest)
-    plan, verdict = _judged(manifest, assignments, timeout)
-    done = apply(plan, verdict.flows, options, dry_run=dry_run, treatment=treatment)
-    return done or exit_code(verdict, strict=False)
+    from lifecycle.supervisor.run.looking import judge_running
 
-
-@command.command("diff")
-@_programming
-def _diff(
-    *,
-    manifest: str,
-    assignments: tuple[str, ...],
-    targets: tuple[str, ...],
-    timeout: float,
-    **rest: Any,
-) -> int:
-    """Compare networks with the verified flows; exits with 4 where they differ."""
     options, treatment = _read(targets, rest)
-    plan, verdict = _judged(manifest, assignments, timeout)
-    differs = diff(plan, verdict.flows, options, treatment=treatment)
-    return differs or exit_code(verdict, strict=False)
+    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout, strict=False)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
+    flows = seen.verdict.flows
+    done = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    return done or exit_code(seen.verdict, strict=False)
 
 
 @command.command("remove")
@@ -516,15 +480,6 @@ def _read(
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
     return options, read_treatment(mapping, label_flows=flow_labels)
-
-
-def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
-    from lifecycle.supervisor.run.looking import judge_running
-
-    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
-    for each in seen.notices:
-        click.echo(lines(each), err=True)
-    return seen.plan, seen.verdict
 
 
 def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
