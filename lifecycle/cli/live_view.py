@@ -15,7 +15,7 @@ from rich.live import Live as RichLive
 from rich.text import Text
 
 from lifecycle.cli.standard_streams import Writer
-from lifecycle.cli.up_output import Rollback, describe
+from lifecycle.cli.up_output import Rollback, RunOutput, describe
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.run.events import (
@@ -42,7 +42,7 @@ _AGAIN_S = 1.0
 _OUTCOMES = {Outcome.OK: "green", Outcome.VIOLATED: "red", Outcome.UNVERIFIABLE: "yellow"}
 
 
-class Live:
+class Live(RunOutput):
     """A listener that draws; use it in a `with`.
 
     Nothing is drawn while the terminal is stopped (Ctrl-S): log lines are counted then.

@@ -58,11 +58,6 @@ if TYPE_CHECKING:
     help="Report a process that dies, but do not take the others down.",
 )
 @click.option(
-    "--timings",
-    is_flag=True,
-    help="Say how long each stage of bring-up took, once it is over or has failed.",
-)
-@click.option(
     "--except",
     "without",
     multiple=True,
@@ -99,7 +94,6 @@ def command(
     strict: bool,
     machine: str,
     keep_going: bool,
-    timings: bool,
     without: tuple[str, ...],
     adopt: bool,
     domain: int | None,
@@ -154,8 +148,7 @@ def command(
                     program=program,
                     treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
                 )
-                timed = until if timings else ""
-                with output(format_, timings_until=timed) as listener, ending.noted():
+                with output(format_) as listener, ending.noted():
 
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from lifecycle.cli.live_view import Live
-from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, Timings
+from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows, watched_flows
 from lifecycle.errors import ExitCode
@@ -41,7 +41,7 @@ from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
 from tests.builders import nfe, node, publisher
 from tests.builders import planned as planned_of
-from tests.unit.supervisor.fakes import run_started, verdict_of
+from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
     ProcessChanged(process="camera", state=ProcessState.RUNNING, pid=7),
@@ -165,52 +165,6 @@ def test_lines_are_what_happens_for_people_and_one_object_each_for_programs() ->
     assert [line.get("event") for line in lines] == [*kinds, None]
     assert lines[1] == {"event": "request", "node": "/camera", "operation": "configure"}
     assert lines[-1]["verdict"] == "ok"
-
-
-def test_a_stage_is_over_with_the_last_node_that_came_so_far() -> None:
-    def judged(outcome: Outcome) -> Event:
-        return VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(outcome))
-
-    came = (
-        (0.5, run_started("/camera", "/arm")),
-        (1.0, NodeChanged(node="/camera", reach=Reach.STARTED)),
-        (1.2, NodeChanged(node="/camera", reach=Reach.CONNECTED)),
-        (1.5, NodeChanged(node="/arm", reach=Reach.STARTED)),
-        (1.6, NodeChanged(node="/arm", reach=Reach.CONFIGURED)),
-        (1.7, judged(Outcome.VIOLATED)),
-        (2.0, NodeChanged(node="/arm", reach=Reach.CONNECTED)),
-        (2.0, SystemReached(reached="connected", elapsed_s=1.5)),
-        (2.25, judged(Outcome.VIOLATED)),
-        (2.5, judged(Outcome.OK)),
-        (3.0, SystemReached(reached="verified", elapsed_s=2.5)),
-        (3.25, NodeChanged(node="/arm", reach=Reach.ACTIVE)),
-        (3.5, NodeChanged(node="/camera", reach=Reach.ACTIVE)),
-        (4.0, SystemReached(reached="active", elapsed_s=3.5)),
-    )
-    text, records = Into(), Into()
-    for output in (PlainLines(text), JsonLines(records)):
-        times = iter([at_s for at_s, _ in came])
-        timings = Timings(output, until="active", clock=lambda times=times: next(times))  # type: ignore[misc]
-        for _, event in came:
-            timings(event)
-    assert [line for line in text.lines if line.startswith("stage")] == [
-        "stage supervisor    0.500 s  at   0.500 s",
-        "stage processes     1.000 s  at   1.500 s  last /arm",
-        "stage configured    0.100 s  at   1.600 s  last /arm",
-        "stage connected     0.400 s  at   2.000 s  last /arm",
-        "stage observed      0.250 s  at   2.250 s",
-        "stage verified      0.750 s  at   3.000 s",
-        "stage active        1.000 s  at   4.000 s  last /camera",
-        "stage total         4.000 s  at   4.000 s",
-    ]
-    stages = [each for each in map(json.loads, records.lines) if each["event"] == "stage"]
-    assert stages[1] == {
-        "event": "stage",
-        "stage": "processes",
-        "took_s": 1.0,
-        "elapsed_s": 1.5,
-        "last": "/arm",
-    }
 
 
 def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_the_cause() -> None:
