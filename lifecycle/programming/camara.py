@@ -191,15 +191,15 @@ class CamaraTarget(ServerTarget):
             return math.inf
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
-        return entry.expires_s - self._api.clock.steady_s() - margin_s
+        return entry.expires_s - self._api.patience.steady_s() - margin_s
 
     def _settled(self, session: _Session) -> _Session:
         """Ask until the session is more than requested, for a while."""
         wait_s = _POLL_S
-        deadline_s = self._api.clock.steady_s() + _SETTLED_S
+        deadline_s = self._api.patience.steady_s() + _SETTLED_S
         path = self.path(session.session_id)
         while session.qos_status == "REQUESTED":
-            left_s = deadline_s - self._api.clock.steady_s()
+            left_s = deadline_s - self._api.patience.steady_s()
             if left_s <= 0:
                 break
             self._api.pause(min(wait_s, left_s))
@@ -217,10 +217,10 @@ class CamaraTarget(ServerTarget):
         # The latest that it can end, if nothing says when.
         left_s: float | None = granted
         if session.expires_at is not None:
-            left_s = session.expires_at.timestamp() - self._api.clock.now_s()
+            left_s = session.expires_at.timestamp() - self._api.patience.now_s()
         return Made(
             id=id_,
-            expires_s=None if left_s is None else self._api.clock.steady_s() + left_s,
+            expires_s=None if left_s is None else self._api.patience.steady_s() + left_s,
             detail=detail,
             differs=differs(body, session, _COMPARED),
         )

@@ -128,7 +128,7 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         id: what the server calls it.
-        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
+        expires_s: on the clock of Patience.steady_s; None if it does not expire.
         detail: for people: "granted for 600 s instead of 3600 s".
         differs: why it is not what was asked for; empty if it is.
     """

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
-from lifecycle.programming.patience import Clock, Deadline, Patience
+from lifecycle.programming.patience import Patience
 from lifecycle.programming.rules import FlowRule, RuleSet, asks
 
 if TYPE_CHECKING:
@@ -105,25 +105,16 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
         return "\n".join(lines)
 
 
-class Means:
+class Means(msgspec.Struct, frozen=True):
     """What targets are opened with.
 
-    Args:
-        ledger: of the system.
-        patience: with servers.
-        clock: for servers.
-
     Attributes:
-        deadline: of everything that the targets ask of servers.
+        ledger: of the system.
+        patience: with servers, of all targets together.
     """
 
-    def __init__(
-        self, ledger: Ledger, *, patience: Patience | None = None, clock: Clock | None = None
-    ) -> None:
-        self.ledger = ledger
-        self.patience = patience or Patience()
-        self.clock = clock or Clock()
-        self.deadline = Deadline()
+    ledger: Ledger
+    patience: Patience = msgspec.field(default_factory=Patience)
 
 
 class Target(abc.ABC):

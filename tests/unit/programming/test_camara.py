@@ -43,7 +43,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     clock = Clock()
     with CamaraServer(clock) as server:
         ledger = ledger_in(tmp_path)
-        targets = Means(ledger, clock=clock)
+        targets = Means(ledger, clock)
 
         def make(**settings: object) -> Target:
             file = settings_file(tmp_path, camara=camara_settings(server.url, **settings))

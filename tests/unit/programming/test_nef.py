@@ -50,7 +50,7 @@ def made(tmp_path: Path, server: NefServer) -> Bench:
     ledger = ledger_in(tmp_path)
     clock = Clock()
     file = settings_file(tmp_path, nef=nef_settings(server.url))
-    targets = Means(ledger, clock=clock)
+    targets = Means(ledger, clock)
 
     def make() -> Target:
         return read_targets(["nef"], {"config": file})[0].open(targets)
