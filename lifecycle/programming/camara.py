@@ -92,25 +92,24 @@ class CamaraTarget(ServerTarget):
     settings_type = CamaraSettings
     collection = "/sessions"
 
-    @staticmethod
-    def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
+    def body(self, rule: FlowRule, end: DeviceEnd) -> Body:
         """Return the body of a CreateSession (QualityOnDemand 1.1.0).
 
         It has no protocol and no direction: it treats what goes between a device's ports and a
         server's ports, both ways, UDP and TCP alike.
         """
-        profile = class_name(rule, settings.qos_profiles, setting="qos_profiles")
+        profile = class_name(rule, self._server.qos_profiles, setting="qos_profiles")
         address = {"publicAddress": end.device, "privateAddress": end.device}
         device: Body = {"ipv4Address": address}
         if end.is_ipv6:
             device = {"ipv6Address": end.device}
         return {
-            **({} if settings.device_by_token else {"device": device}),
+            **({} if self._server.device_by_token else {"device": device}),
             "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
             "devicePorts": {"ports": [end.device_port]},
             "applicationServerPorts": {"ports": [end.server_port]},
             "qosProfile": profile,
-            "duration": settings.duration_s,
+            "duration": self._server.duration_s,
         }
 
     def create(self, body: Body) -> Made:

@@ -195,6 +195,15 @@ class Programmer(Removal):
         with self._ledger.locked():
             return tuple(each.plan(rules) for each in self._targets)
 
+    def export(self, flows: Iterable[FlowReport]) -> str:
+        """Return what targets would be given if nothing were there, as text.
+
+        Raises:
+            ValueError: see `Target.export`.
+        """
+        rules = self.rules(flows)
+        return "".join(each.export(rules) for each in self._targets)
+
     def update(
         self,
         flows: Iterable[FlowReport],

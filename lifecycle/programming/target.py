@@ -160,9 +160,8 @@ class Target(abc.ABC):
             SettingsError: the settings file is gone, or is of another server now.
         """
 
-    @classmethod
     @abc.abstractmethod
-    def export(cls, settings: Any, rules: RuleSet, system: str) -> str:
+    def export(self, rules: RuleSet) -> str:
         """Return what the network would be given, as text, and what is left out of it.
 
         Raises:

@@ -187,13 +187,13 @@ def export(plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: 
     Raises:
         UsageError: it cannot be exported so.
     """
-    rules = _open(plan, (), treatment).rules(flows)
+    programmer = _open(plan, (network,), treatment)
     try:
-        text = network.target.export(network.settings, rules, plan.system)
+        text = programmer.export(flows)
     except ValueError as error:
         raise UsageError(str(error), hint=network.target.hint) from error
     click.echo(text, nl=False)
-    _show_left_out(rules.left_out)
+    _show_left_out(programmer.left_out)
 
 
 _EMPTY_GRAPH_S = 1.5

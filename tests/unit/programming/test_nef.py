@@ -315,6 +315,6 @@ def test_the_token_is_in_requests_and_nowhere_else(
         traceback.TracebackException.from_exception(caught.value, capture_locals=True).format()
     )
     files = [each.read_text() for each in tmp_path.rglob("*") if each.is_file()]
-    dump = bench.target.document(RuleSet(rules=(rule(),)), bench.target._server)
+    dump = bench.target.export(RuleSet(rules=(rule(),)))
     for text in (caplog.text, trace, dump, repr(vars(bench.target)), *files):
         assert TOKEN not in text

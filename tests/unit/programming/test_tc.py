@@ -8,9 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
-from lifecycle.programming.rules import RuleSet
 from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget, class_of, classes_of, divide
 from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO
+from tests.unit.programming.samples import exported
 
 
 def settings(**rest: object) -> TcSettings:
@@ -28,7 +28,7 @@ def cannot(message: str) -> object:
 
 
 def script(case: TcSettings) -> str:
-    return TcTarget.export(case, RuleSet(rules=RULES, left_out=LEFT_OUT), "teleop")
+    return exported(TcTarget, case, RULES, left_out=LEFT_OUT)
 
 
 @pytest.mark.parametrize("name", CASES)
