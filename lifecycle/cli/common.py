@@ -11,7 +11,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from lifecycle.manifest.model import Manifest
     from lifecycle.plan.model import Plan
     from lifecycle.plan.programs import Resolution
+    from lifecycle.programming.rules import Treatment
+    from lifecycle.programming.target import Chosen
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -381,6 +383,33 @@ def export_option(function: F) -> F:
 
 
 NETWORKS = ("nft", "tc", "nef", "camara")
+
+
+def read_networks(
+    targets: Sequence[str], given: Mapping[str, Any], *, option: str
+) -> tuple[tuple[Chosen, ...], Treatment | None]:
+    """Return the networks that were chosen, and what flows get; nothing where nothing was given.
+
+    Args:
+        targets: values of the option that chooses networks.
+        given: values of those that `network_options` adds beside it.
+        option: for messages, `--program`.
+
+    Raises:
+        UsageError: they do not fit together.
+    """
+    if not targets and not any(given.values()):
+        return (), None
+    # What programs networks takes long to import.
+    from lifecycle.programming.programmer import read_treatment
+    from lifecycle.programming.target import read_targets
+
+    given = dict(given)
+    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
+    chosen = read_targets(targets, given, option=option)
+    if not chosen:
+        raise UsageError(f"cannot use --dscp-from-5qi or --flow-labels without {option}")
+    return chosen, read_treatment(mapping, label_flows=flow_labels)
 
 
 def _network(first: Callable[[F], F]) -> Callable[[F], F]:

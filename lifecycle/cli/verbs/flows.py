@@ -10,7 +10,7 @@ import datetime as dt
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from lifecycle.cli.common import (
     load_plan,
     manifest_arguments,
     network_options,
+    read_networks,
     target_argument,
     target_plan,
     terminal_width,
@@ -181,7 +182,9 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-def export(plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment) -> None:
+def export(
+    plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment | None
+) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
@@ -258,7 +261,7 @@ def _show(
         if watch:
             raise UsageError("cannot use --export with --watch; export once")
         # What is exported for a network takes what programming it takes.
-        (network,), treatment = _read((export_,), rest, option="--export")
+        (network,), treatment = read_networks((export_,), rest, option="--export")
         exported = (network, treatment)
     elif any(rest.values()):
         raise UsageError(
@@ -397,7 +400,9 @@ def _apply(
     """
     from lifecycle.supervisor.run.looking import judge_running
 
-    options, treatment = _read(targets, rest)
+    options, treatment = read_networks(targets, rest, option="--target")
+    if not options:
+        raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
     seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout, strict=False)
     for each in seen.notices:
         click.echo(lines(each), err=True)
@@ -411,21 +416,6 @@ def _apply(
 def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
     return remove(load_plan(manifest, assignments))
-
-
-def _read(
-    targets: tuple[str, ...], given: Mapping[str, Any], option: str = "--target"
-) -> tuple[tuple[Chosen, ...], Treatment]:
-    """Read the options of networks, and of what flows get, before anything is looked at."""
-    from lifecycle.programming.programmer import read_treatment
-    from lifecycle.programming.target import read_targets
-
-    given = dict(given)
-    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
-    options = read_targets(targets, given, option=option)
-    if not options:
-        raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
-    return options, read_treatment(mapping, label_flows=flow_labels)
 
 
 def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:

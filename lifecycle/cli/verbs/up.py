@@ -12,17 +12,17 @@ from lifecycle.cli.common import (
     machine_option,
     manifest_arguments,
     network_options,
+    read_networks,
     timeout_option,
 )
 from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import ExitCode
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult
@@ -98,8 +98,6 @@ def command(
     adopt: bool,
     domain: int | None,
     targets: tuple[str, ...],
-    mapping: str,
-    flow_labels: bool,
     **rest: Any,
 ) -> int:
     """Bring a system up: start, configure, connect, verify, and only then activate.
@@ -121,7 +119,7 @@ def command(
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            program = _networks(targets, **rest)
+            program, treatment = read_networks(targets, rest, option="--program")
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
@@ -146,7 +144,7 @@ def command(
                     keep_going=keep_going,
                     adopt=adopt,
                     program=program,
-                    treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
+                    treatment=treatment,
                 )
                 with output(format_) as listener, ending.noted():
 
@@ -188,22 +186,3 @@ def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> Exi
     unwritten = written_or_said(lambda: written.end(result.verdict, result.plan))
     listener.finish(result)
     return result.exit_code or unwritten
-
-
-def _networks(targets: tuple[str, ...], **given: Any) -> tuple[Chosen, ...]:
-    """What programs networks takes long to import, so only where it is asked for."""
-    if not targets and not any(given.values()):
-        return ()
-    from lifecycle.programming.target import read_targets
-
-    return read_targets(targets, given, option="--program")
-
-
-def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
-    if targets:
-        from lifecycle.programming.programmer import read_treatment
-
-        return read_treatment(mapping, label_flows=flow_labels)
-    if mapping or flow_labels:
-        raise UsageError("cannot use --dscp-from-5qi or --flow-labels without --program")
-    return None
