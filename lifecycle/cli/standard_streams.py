@@ -132,7 +132,7 @@ def own_streams(*, waits: bool = True) -> Streams:
     if writer is None:
         _replace("stderr", _Tolerant(stderr))
     else:
-        _replace("stderr", _Queued(writer, kept=False))
+        _replace("stderr", _Queued(writer))
         _never_wait(_STDERR)
     os.dup2(_STDERR, _STDOUT)
     return Streams(stdout, writer)
@@ -274,15 +274,6 @@ class Writer:
         """Whether a reader has stopped, is too slow, or has gone."""
         return self._gone or self._bytes > _BEHIND_BYTES
 
-    def stream(self) -> TextIO:
-        """Return a text stream of which every write is kept."""
-        return io.TextIOWrapper(
-            cast("io.BufferedWriter", _Queued(self, kept=True)),
-            encoding=self._encoding,
-            errors="backslashreplace",
-            write_through=True,
-        )
-
     def close(self) -> None:
         """Write what is left, for as long as it is taken; say what is lost in the end.
 
@@ -370,12 +361,11 @@ def _lines_are(number: int) -> str:
 class _Queued(_Raw):
     """The raw end of a stream that a Writer writes."""
 
-    def __init__(self, writer: Writer, *, kept: bool) -> None:
+    def __init__(self, writer: Writer) -> None:
         super().__init__(writer.descriptor)
         self._writer = writer
-        self._kept = kept
 
     def write(self, data: ReadableBuffer) -> int:
         whole = bytes(data)
-        self._writer.put(whole.decode(errors="replace"), kept=self._kept)
+        self._writer.put(whole.decode(errors="replace"), kept=False)
         return len(whole)

@@ -1,4 +1,4 @@
-"""Output of `lifecycle up`: JSON lines, plain lines, or a live view on a terminal.
+"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them.
 
 Owns: the choice between them and the two line formats. Everything comes from the supervisor's
 events.
@@ -6,9 +6,11 @@ events.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import json
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,6 +18,7 @@ from typing import Any
 import click
 
 from lifecycle.cli.standard_streams import Writer
+from lifecycle.cli.verbs.control import status_head
 from lifecycle.node.host.control import Operation
 from lifecycle.printable import count, json_text, log_line, one_line
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
@@ -52,6 +55,8 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Stage, Verdict
 
+_AGAIN_S = 1.0
+
 
 class RunOutput:
     """A listener that also shows how the run ended."""
@@ -75,21 +80,20 @@ def output(format_: str) -> Iterator[RunOutput]:
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
+    marker = _json_notice if format_ == "json" else "{}\n".format
+    is_terminal = format_ != "json" and sys.stdout.isatty()
     writer = Writer(
         sys.stdout.fileno(),
         "standard output",
-        marker=_json_notice if format_ == "json" else "{}\n".format,
+        marker="\r\x1b[K{}\n".format if is_terminal else marker,
         say=functools.partial(click.echo, err=True),
         encoding=sys.stdout.encoding,
     )
-    with contextlib.ExitStack() as stack:
-        stack.callback(writer.close)
+    with contextlib.closing(writer):
         if format_ == "json":
             yield JsonLines(writer)
-        elif sys.stdout.isatty():
-            from lifecycle.cli.live_view import Live  # rich, which nothing else needs
-
-            yield stack.enter_context(Live(writer=writer))
+        elif is_terminal:
+            yield TerminalLines(writer)
         else:
             yield PlainLines(writer)
 
@@ -173,8 +177,10 @@ _LOST = ("unconfigured", "inactive", "finalized", "errorprocessing")
 class PlainLines(RunOutput):
     """One line per event, for logs and pipes."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: Writer, *, colour: bool = False, width: int = 100) -> None:
         self._writer = writer
+        self._colour = colour
+        self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
@@ -195,13 +201,59 @@ class PlainLines(RunOutput):
                 return
             self._judged = line
         if line is not None and not hidden:
-            self._writer.put(line + "\n", kept=not isinstance(event, LogLine))
+            self._put(line + "\n", kept=not isinstance(event, LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
         flows = result.verdict.verdict is not Outcome.VIOLATED
-        self._writer.put(render_text(result.verdict, flows=flows))
+        text = render_text(result.verdict, flows=flows, colour=self._colour, width=self._width)
+        self._put(text)
         self._writer.close()
+
+    def _put(self, text: str, *, kept: bool = True) -> None:
+        self._writer.put(text, kept=kept)
+
+
+class TerminalLines(PlainLines):
+    """Lines that scroll above one that says what is going on, redrawn in place."""
+
+    def __init__(self, writer: Writer) -> None:
+        super().__init__(writer, colour=True, width=shutil.get_terminal_size().columns)
+        self._status: Callable[[], SystemStatus] | None = None
+        self._below = ""
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Take the way to ask for what is going on; it is shown each second, as time passes."""
+        self._status = status
+        loop = asyncio.get_running_loop()
+
+        def again() -> None:
+            self._look()
+            if not self._writer.is_behind:
+                self._put("", kept=False)
+            loop.call_later(_AGAIN_S, again)
+
+        again()
+
+    def __call__(self, event: Event) -> None:
+        """Write one event, and what is going on since."""
+        if isinstance(event, SystemReached | VerdictChanged | Stopping):
+            self._look()
+        super().__call__(event)
+
+    def finish(self, result: UpResult) -> None:
+        """Write the verdict in the place of what was going on."""
+        self._below = ""
+        super().finish(result)
+
+    def _look(self) -> None:
+        if self._status is not None:
+            self._width = shutil.get_terminal_size().columns
+            self._below = status_head(self._status())[: self._width - 1]
+
+    def _put(self, text: str, *, kept: bool = True) -> None:
+        # The cursor stays in front of the line, for what others write.
+        self._writer.put(f"\r\x1b[K{text}{self._below}\r", kept=kept)
 
 
 def describe(event: Event) -> str | None:

@@ -56,19 +56,8 @@ def status_text(
             are as they should be are left out; 0 shows all.
         colour: mark nodes that are not as they should be by ANSI colours.
     """
-    verdict = "not judged yet" if status.verdict is None else status.verdict.value
-    verdict += f" ({status.not_ok})" if status.not_ok else ""
-    living = sum(not node.died and node.next_try_s is None for node in status.nodes)
-    number = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
-    mode = f", mode {status.mode}" if status.mode else ""
-    applied = f", revision {status.revision}: {status.manifest}" if status.revision > 1 else ""
-    phase = f"{status.phase} ({status.ends})" if status.ends else status.phase
-    head = (
-        f"{status.system}: {phase}{number}{mode}, verdict {verdict}, "
-        f"domain {status.domain_id}, supervisor {status.supervisor}, "
-        f"up for {status.elapsed_s:.1f} s{applied}"
-    )
-    above = list(map(one_line, filter(None, (head, measured_summary(status.measured)))))
+    measured = one_line(measured_summary(status.measured))
+    above = [status_head(status), *([measured] if measured else [])]
     longest = max(_LEAST, width - _BESIDE) if height else 0
     heads, *rows = columns([_HEADS, *(_row(each, longest) for each in status.nodes)])
     shown = [
@@ -79,6 +68,22 @@ def status_text(
         return wrapped([*above, heads, *(line for each in shown for line in each)], width)
     above = [*wrapped(above, width).splitlines(), heads]
     return "\n".join([*above, *_that_fit(status, shown, height - len(above))])
+
+
+def status_head(status: SystemStatus) -> str:
+    """Return in one line what is going on."""
+    verdict = "not judged yet" if status.verdict is None else status.verdict.value
+    verdict += f" ({status.not_ok})" if status.not_ok else ""
+    living = sum(not node.died and node.next_try_s is None for node in status.nodes)
+    number = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
+    mode = f", mode {status.mode}" if status.mode else ""
+    applied = f", revision {status.revision}: {status.manifest}" if status.revision > 1 else ""
+    phase = f"{status.phase} ({status.ends})" if status.ends else status.phase
+    return one_line(
+        f"{status.system}: {phase}{number}{mode}, verdict {verdict}, "
+        f"domain {status.domain_id}, supervisor {status.supervisor}, "
+        f"up for {status.elapsed_s:.1f} s{applied}"
+    )
 
 
 def _that_fit(status: SystemStatus, shown: list[list[str]], height: int) -> list[str]:
