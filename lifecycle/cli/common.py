@@ -306,7 +306,14 @@ def target_run(
     """
     path, plan = target_plan(environment, target, assignments, machine)
     if plan is not None:
-        say_differences(path, plan)
+        from lifecycle.supervisor.control.client import differences
+
+        if found := differences(path, plan):
+            listed = "\n".join(found)
+            click.echo(
+                f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}",
+                err=True,
+            )
     return path
 
 
@@ -321,17 +328,6 @@ def asking(path: Path) -> Iterator[None]:
         from lifecycle.run_directory import lost
 
         raise lost(path) from error
-
-
-def say_differences(path: Path, plan: Plan) -> None:
-    """Say on stderr where a manifest is not the one that runs."""
-    from lifecycle.supervisor.control.client import differences
-
-    if found := differences(path, plan):
-        listed = "\n".join(found)
-        click.echo(
-            f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}", err=True
-        )
 
 
 def is_manifest(target: str) -> bool:

@@ -224,19 +224,15 @@ def divide(
             peak, or it queues behind itself.
 
     Raises:
-        ValueError: a rate is not positive, an unknown class has one, or there is not enough.
+        ValueError: an unknown class has a rate, or there is not enough.
     """
     names = [each.name for each in classes]
-    if link_kbit < 1:
-        raise ValueError(f"cannot divide a link of {link_kbit} kbit/s; use 1 or more")
-    for name, rate in guaranteed_kbit.items():
+    for name in guaranteed_kbit:
         if name not in names:
             raise ValueError(
                 f"cannot guarantee a rate to class {name!r}; classes of these rules are: "
                 f"{', '.join(names) or 'none'}"
             )
-        if rate < 1:
-            raise ValueError(f"cannot guarantee {rate} kbit/s to class {name}; use 1 or more")
     every = sorted((*classes, _REST))
     given = {
         each: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))

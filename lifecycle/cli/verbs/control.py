@@ -17,7 +17,6 @@ from lifecycle.cli.common import (
     assignments_argument,
     format_option,
     machine_option,
-    say_differences,
     target_argument,
     target_arguments,
     target_plan,
@@ -275,9 +274,11 @@ def _give_order(
         UsageError: no such run.
         ManifestError: the manifest cannot be loaded.
     """
-    path, plan = target_plan(os.environ, target, assignments, machine)
-    if verb == "pause" and plan is not None:
-        say_differences(path, plan)
+    plan = None
+    if verb == "pause":  # which may be of a manifest that has changed
+        path = target_run(os.environ, target, assignments, machine)
+    else:
+        path, plan = target_plan(os.environ, target, assignments, machine)
     from lifecycle.supervisor.control.client import order
     from lifecycle.supervisor.control.protocol import ControlRequest, Question
 
