@@ -46,13 +46,10 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
         url: everything before `/sessions`.
         qos_profiles: the provider's names of profiles, by 5QI.
         duration_s: 1–2147483647; sessions are renewed, or they expire.
-        device_by_token: the access token names the device (three-legged), so that the body must
-            not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
     """
 
     qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
     duration_s: int = 3600
-    device_by_token: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,7 +101,7 @@ class CamaraTarget(ServerTarget):
         if end.is_ipv6:
             device = {"ipv6Address": end.device}
         return {
-            **({} if self._server.device_by_token else {"device": device}),
+            "device": device,
             "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
             "devicePorts": {"ports": [end.device_port]},
             "applicationServerPorts": {"ports": [end.server_port]},
@@ -139,7 +136,7 @@ class CamaraTarget(ServerTarget):
         if id_:
             reply = self._api.request("GET", self.path(id_), may_be_gone=True)
             return None if reply.gone else self._made(reply.read(_Session), body)
-        asked = {"device": body["device"]} if "device" in body else {}
+        asked = {"device": body["device"]}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
         for each in () if reply.gone else reply.read(tuple[_Session, ...]):
             if not differs(body, each, _COMPARED, missing=True):
