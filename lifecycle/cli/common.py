@@ -20,6 +20,7 @@ import click
 from lifecycle.cli.completion import completing
 from lifecycle.errors import UsageError, did_you_mean
 from lifecycle.printable import lines
+from lifecycle.programming.names import TARGETS
 
 if TYPE_CHECKING:
     from lifecycle.manifest.loading import Loaded
@@ -361,7 +362,7 @@ def target_plan(
 def network_options(flag: str, help_: str) -> Callable[[F], F]:
     """Add the option that chooses networks to program, what each needs, and what flows get."""
     return _network(
-        click.option(flag, "targets", type=click.Choice(NETWORKS), multiple=True, help=help_)
+        click.option(flag, "targets", type=click.Choice(TARGETS), multiple=True, help=help_)
     )
 
 
@@ -371,14 +372,11 @@ def export_option(function: F) -> F:
         click.option(
             "--export",
             "export_",
-            type=click.Choice(NETWORKS),
+            type=click.Choice(TARGETS),
             help="Print the verified flows as rules, settings or request bodies of another system "
             "instead.",
         )
     )(function)
-
-
-NETWORKS = ("nft", "tc", "nef", "camara")
 
 
 def read_networks(

@@ -19,7 +19,8 @@ import msgspec
 import yaml
 
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.target import TARGETS, SettingsError, target_kind
+from lifecycle.programming.names import TARGETS
+from lifecycle.programming.target import SettingsError, target_kind
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024

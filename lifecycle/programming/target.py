@@ -1,8 +1,7 @@
 """What a network target is, which there are, what it changes, and what can go wrong.
 
 Owns: `Target`, which plans, applies and removes; the names of all of them; their answers as text;
-the errors of this package. A target is a module here that has its class as `TARGET`, and one name
-in `TARGETS`; it is imported on first use.
+the errors of this package. A target is imported on first use, see `names`.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.programming.names import TARGETS
 from lifecycle.programming.patience import Patience
 from lifecycle.programming.rules import FlowRule, RuleSet, asks
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-TARGETS = ("nft", "tc", "nef", "camara")
 
 _TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
 """Targets → options that only they take."""

@@ -18,7 +18,6 @@ import click
 from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import (
-    NETWORKS,
     asking,
     assignments_argument,
     export_option,
@@ -45,6 +44,7 @@ from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, json_text, lines, one_line, shown_length
 from lifecycle.programming.flows_csv import flows_to_csv
+from lifecycle.programming.names import TARGETS
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
@@ -402,7 +402,7 @@ def _apply(
 
     options, treatment = read_networks(targets, rest, option="--target")
     if not options:
-        raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
+        raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout, strict=False)
     for each in seen.notices:
         click.echo(lines(each), err=True)
