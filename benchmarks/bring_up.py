@@ -56,6 +56,7 @@ from benchmarks.measuring import (
 )
 
 HERE = Path(__file__).resolve()
+STAGES = ("started", "configured", "connected", "verified", "active")
 SIZES = (1, 5, 10, 20, 50, 100)
 CHAIN = 5
 PROGRAMS = {
@@ -159,21 +160,21 @@ def measure(
         )
     stages: dict[str, float] = {}
     failures: list[str] = []
+    before_s = time.monotonic()
 
     def is_active(line: str) -> bool:
+        """Note when the last node, or the system, has come so far."""
         event = json.loads(line)
         if event.get("event") == "failure":
             failures.append(event["message"])
-        if event.get("event") != "stage":
-            return False
-        stages[event["stage"]] = event["took_s"]
-        # The last one comes right after the event that the system is active, or before its end.
-        return event["stage"] == "total" and "active" in stages
+        if reached := event.get("reach") or event.get("reached"):
+            stages[reached] = time.monotonic()
+        return event.get("event") == "system" and bool(event["reached"] == "active")
 
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "bring_up.lifecycle.yaml"
         file.write_text(yaml.safe_dump(manifest(nodes, shape, domain_id, range_)))
-        verb = ("up", str(file), "--format", "json", "--timings", "--timeout", str(bound_s))
+        verb = ("up", str(file), "--format", "json", "--timeout", str(bound_s))
         try:
             used = run(
                 [sys.executable, "-m", "lifecycle.cli", *verb],
@@ -183,8 +184,10 @@ def measure(
             )
         except FailedError as error:
             raise FailedError("; ".join([str(error), *failures[:1]])) from None
-    for stage, took_s in stages.items():
+    for stage in filter(stages.__contains__, STAGES):
+        took_s = max(0.0, stages[stage] - before_s)
         findings.stages.setdefault(nodes, {}).setdefault(stage, []).append(took_s)
+        before_s = stages[stage]
     return used
 
 

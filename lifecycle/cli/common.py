@@ -11,7 +11,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,12 +20,15 @@ import click
 from lifecycle.cli.completion import completing
 from lifecycle.errors import UsageError, did_you_mean
 from lifecycle.printable import lines
+from lifecycle.programming.names import TARGETS
 
 if TYPE_CHECKING:
     from lifecycle.manifest.loading import Loaded
     from lifecycle.manifest.model import Manifest
     from lifecycle.plan.model import Plan
     from lifecycle.plan.programs import Resolution
+    from lifecycle.programming.rules import Treatment
+    from lifecycle.programming.target import Chosen
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -227,10 +230,32 @@ def write_text(path: Path, text: str) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        replace_text(path, text)
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"cannot write {str(path)!r}: {why}") from error
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old one or the new one, whole.
+
+    What is no regular file, `/dev/null` or a pipe, is written to and stays what it is.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if path.exists() and not path.is_file():
+        path.write_text(text, encoding="utf-8")
+        return
+    whole = path.resolve()
+    part = whole.with_name(f".{whole.name}.{os.getpid()}")
+    try:
+        with part.open("x", encoding="utf-8") as file:
+            file.write(text)
+        part.replace(whole)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def terminal_width() -> int:
@@ -282,7 +307,14 @@ def target_run(
     """
     path, plan = target_plan(environment, target, assignments, machine)
     if plan is not None:
-        say_differences(path, plan)
+        from lifecycle.supervisor.control.client import differences
+
+        if found := differences(path, plan):
+            listed = "\n".join(found)
+            click.echo(
+                f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}",
+                err=True,
+            )
     return path
 
 
@@ -297,17 +329,6 @@ def asking(path: Path) -> Iterator[None]:
         from lifecycle.run_directory import lost
 
         raise lost(path) from error
-
-
-def say_differences(path: Path, plan: Plan) -> None:
-    """Say on stderr where a manifest is not the one that runs."""
-    from lifecycle.supervisor.control.client import differences
-
-    if found := differences(path, plan):
-        listed = "\n".join(found)
-        click.echo(
-            f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}", err=True
-        )
 
 
 def is_manifest(target: str) -> bool:
@@ -341,7 +362,7 @@ def target_plan(
 def network_options(flag: str, help_: str) -> Callable[[F], F]:
     """Add the option that chooses networks to program, what each needs, and what flows get."""
     return _network(
-        click.option(flag, "targets", type=click.Choice(NETWORKS), multiple=True, help=help_)
+        click.option(flag, "targets", type=click.Choice(TARGETS), multiple=True, help=help_)
     )
 
 
@@ -351,14 +372,38 @@ def export_option(function: F) -> F:
         click.option(
             "--export",
             "export_",
-            type=click.Choice(NETWORKS),
+            type=click.Choice(TARGETS),
             help="Print the verified flows as rules, settings or request bodies of another system "
             "instead.",
         )
     )(function)
 
 
-NETWORKS = ("nft", "tc", "nef", "camara")
+def read_networks(
+    targets: Sequence[str], given: Mapping[str, Any], *, option: str
+) -> tuple[tuple[Chosen, ...], Treatment | None]:
+    """Return the networks that were chosen, and what flows get; nothing where nothing was given.
+
+    Args:
+        targets: values of the option that chooses networks.
+        given: values of those that `network_options` adds beside it.
+        option: for messages, `--program`.
+
+    Raises:
+        UsageError: they do not fit together.
+    """
+    if not targets and not any(given.values()):
+        return (), None
+    # What programs networks takes long to import.
+    from lifecycle.programming.programmer import read_treatment
+    from lifecycle.programming.target import read_targets
+
+    given = dict(given)
+    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
+    chosen = read_targets(targets, given, option=option)
+    if not chosen:
+        raise UsageError(f"cannot use --dscp-from-5qi or --flow-labels without {option}")
+    return chosen, read_treatment(mapping, label_flows=flow_labels)
 
 
 def _network(first: Callable[[F], F]) -> Callable[[F], F]:

@@ -21,14 +21,11 @@ from typing import Any
 
 import msgspec
 
-from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.errors import UsageError
 from lifecycle.export.manifest_yaml import Noted, Tree, comment, literal, to_yaml
 from lifecycle.export.programs import LOG_LEVELS
 from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.names import free_name
-
-MAX_ENTITIES = 10_000
-"""Actions of one launch description, those of files that it includes with them."""
 
 
 class LaunchedNode(msgspec.Struct, kw_only=True):
@@ -104,8 +101,6 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     )
     try:
         walk.begin(path, arguments)
-    except LifecycleError:
-        raise
     except Exception as problem:
         # Anything: a launch file is a program, and launch raises what its parsers raise.
         said = [each.strip(" -:") for each in str(problem).splitlines()]
@@ -140,7 +135,6 @@ class _Walk:
         self.found = Launched()
         self._context = context
         self._environment = dict(os.environ)
-        self._left = MAX_ENTITIES
 
     def begin(self, path: Path, arguments: Mapping[str, str]) -> None:
         """Evaluate a launch file, whatever its language."""
@@ -156,9 +150,6 @@ class _Walk:
 
     def visit(self, entity: Any, notes: tuple[str, ...] = ()) -> None:
         """Carry out what sets something, read what would start something."""
-        self._left -= 1
-        if self._left < 0:
-            raise UsageError(f"cannot import more than {MAX_ENTITIES} actions of one launch file")
         kinds = [each.__name__ for each in type(entity).__mro__]
         if "Action" in kinds and not self._holds(entity.condition):
             return

@@ -8,7 +8,6 @@ nothing: it is opened before the rest of a command is imported.
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import replace
 
+from lifecycle.cli.common import replace_text
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import count, lines
 
@@ -60,8 +60,8 @@ def open_report(path: Path) -> None:
     """
     report_format(path)
     try:
-        if _is_file(path):
-            path.write_bytes(b"")
+        if not _is_stream(path):
+            replace_text(path, "")
         elif not os.access(path, os.W_OK):
             raise PermissionError(13, "Permission denied")
     except OSError as error:
@@ -69,40 +69,15 @@ def open_report(path: Path) -> None:
 
 
 def write_report(path: Path, text: str) -> None:
-    """Replace what is in a report.
+    """Replace what is in a report: half of one might read as a success.
 
     Raises:
         UsageError: it cannot be written any more.
     """
-    data = (text.rstrip("\n") + "\n").encode()
     try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
-        try:
-            _replace(file, data)
-        finally:
-            os.close(file)
+        replace_text(path, text.rstrip("\n") + "\n")
     except OSError as error:
         raise _unwritable(path, error) from error
-
-
-def _replace(file: int, data: bytes) -> None:
-    """Replace what is in a file: all of it, or where a disk is full none of it.
-
-    Half a report might read as a success; what is there says that the command never ended.
-    """
-    is_file = stat.S_ISREG(os.fstat(file).st_mode)
-    if is_file and hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, len(data))
-    try:
-        left = memoryview(data)
-        while left:
-            left = left[os.write(file, left) :]
-    except OSError:
-        if is_file:
-            os.ftruncate(file, 0)
-        raise
-    if is_file:
-        os.ftruncate(file, len(data))
 
 
 def written_or_said(write: Callable[[], None]) -> ExitCode:
@@ -182,7 +157,7 @@ class ReportFile:
     def __init__(self, path: Path | None, *, strict: bool = False) -> None:
         self._path = path
         self._strict = strict
-        self._waits = path is not None and not _is_file(path)
+        self._waits = path is not None and _is_stream(path)
         self._plan: Plan | None = None
         self._ended = False
 
@@ -276,19 +251,9 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
     return replace(NOT_JUDGED, run=run)
 
 
-def _is_file(path: Path) -> bool:
-    """Whether it is a file or will be one; a pipe or a terminal is written once, in the end.
-
-    Raises:
-        OSError: it is a directory, or cannot be looked at.
-    """
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        return True
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(21, "it is a directory")
-    return stat.S_ISREG(mode)
+def _is_stream(path: Path) -> bool:
+    """Whether it is a pipe or a terminal, which is written once, in the end."""
+    return path.exists() and not (path.is_file() or path.is_dir())
 
 
 def _unwritable(path: Path, error: OSError) -> UsageError:

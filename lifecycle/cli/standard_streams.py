@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TextIO, cast
+from typing import TYPE_CHECKING, TextIO, cast
 
 import click
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 _STDIN, _STDOUT, _STDERR = 0, 1, 2
 
 LINE_BYTES = 2**20
-"""Log lines are dropped while so much is unread, until half of it was read."""
+"""Log lines are lost while so much is unread, until half of it was read."""
 
 EVENT_BYTES = 2**24
-"""Of everything else so much waits for a reader; beyond it the oldest goes."""
+"""Of everything else so much waits for a reader; what comes then is lost, too."""
 
 DRAIN_S = 2.0
 """In the end, a reader that takes nothing for so long is not waited for."""
@@ -132,7 +132,7 @@ def own_streams(*, waits: bool = True) -> Streams:
     if writer is None:
         _replace("stderr", _Tolerant(stderr))
     else:
-        _replace("stderr", _Queued(writer, kept=False))
+        _replace("stderr", _Queued(writer))
         _never_wait(_STDERR)
     os.dup2(_STDERR, _STDOUT)
     return Streams(stdout, writer)
@@ -215,9 +215,6 @@ class Writer:
         say: takes messages that the stream itself cannot take, from any thread.
         encoding: of the texts.
 
-    Attributes:
-        on_room: called from the thread when everything was taken.
-
     Raises:
         MiddlewareError: there is no room for another thread.
     """
@@ -236,12 +233,11 @@ class Writer:
         self._marker = marker
         self._say = say
         self._encoding = encoding
-        self.on_room: Callable[[], object] = lambda: None
         self._changed = threading.Condition()
-        self._queue: collections.deque[tuple[bytes, _Lost]] = collections.deque()
+        # Each with the number of lines that are lost with it: a note stands for those it is about.
+        self._queue: collections.deque[tuple[bytes, int]] = collections.deque()
         self._bytes = 0
-        self._lost = _NOTHING
-        self._noting = _NOTHING  # what the note that is being written says
+        self._lost = 0
         self._full = ""  # why the disk takes nothing
         self._said_full = False
         self._gone = False
@@ -262,33 +258,21 @@ class Writer:
             text: what to write.
             kept: False for a log line.
         """
-        data = text.encode(self._encoding, "backslashreplace")
-        weight = _Lost(events=1) if kept else _Lost(lines=1)
+        size = len(data := text.encode(self._encoding, "backslashreplace"))
         with self._changed:
             if self._gone or self._closing:
                 return
             self._note_lost()
-            if not kept and (self._lost.lines or self._bytes + len(data) > LINE_BYTES):
-                self._lost += weight
-                return
-            self._append(data, weight)
-            while self._bytes > EVENT_BYTES and len(self._queue) > 1:
-                self._lost += self._take()[1]
-            self._changed.notify_all()
+            has_room = self._bytes + size <= (EVENT_BYTES if kept else LINE_BYTES)
+            if has_room and (kept or not self._lost):
+                self._append(data, text.count("\n"))
+            else:
+                self._lost += text.count("\n")
 
     @property
     def is_behind(self) -> bool:
         """Whether a reader has stopped, is too slow, or has gone."""
         return self._gone or self._bytes > _BEHIND_BYTES
-
-    def stream(self) -> TextIO:
-        """Return a text stream of which every write is kept."""
-        return io.TextIOWrapper(
-            cast("io.BufferedWriter", _Queued(self, kept=True)),
-            encoding=self._encoding,
-            errors="backslashreplace",
-            write_through=True,
-        )
 
     def close(self) -> None:
         """Write what is left, for as long as it is taken; say what is lost in the end.
@@ -305,28 +289,24 @@ class Writer:
             self._thread.join(DRAIN_S)
         with self._changed:
             gone, self._gone = self._gone, True
-            lost = sum((each for _, each in self._queue), self._noting + self._lost)
-        if any(lost) and not gone:
-            self._say(f"{lost} missing at the end of {self._name}: {self._why}")
+            lost = self._lost + sum(number for _, number in self._queue)
+        if lost and not gone:
+            self._say(f"{_lines_are(lost)} missing at the end of {self._name}: {self._why}")
 
     @property
     def _why(self) -> str:
         return self._full or f"nobody read {self._name} in time"
 
-    def _append(self, data: bytes, weight: _Lost) -> None:
-        self._queue.append((data, weight))
+    def _append(self, data: bytes, number: int) -> None:
+        self._queue.append((data, number))
         self._bytes += len(data)
-
-    def _take(self) -> tuple[bytes, _Lost]:
-        data, weight = self._queue.popleft()
-        self._bytes -= len(data)
-        return data, weight
+        self._changed.notify_all()
 
     def _note_lost(self) -> None:
         """Queue a note on what is lost, once there is room."""
-        if any(self._lost) and self._bytes <= LINE_BYTES // 2:
-            note = self._marker(f"{self._lost} missing here: {self._why}")
-            lost, self._lost = self._lost, _NOTHING
+        if self._lost and self._bytes <= LINE_BYTES // 2:
+            note = self._marker(f"{_lines_are(self._lost)} missing here: {self._why}")
+            lost, self._lost = self._lost, 0
             self._append(note.encode(self._encoding, "backslashreplace"), lost)
 
     def _run(self) -> None:
@@ -336,30 +316,30 @@ class Writer:
                 self._changed.wait_for(lambda: self._gone or self._closing or self._queue)
                 if self._gone or not self._queue:
                     return
-                text, weight = self._take()
-                self._noting = weight if sum(weight) > 1 else _NOTHING
-                if not self._full:
-                    self._note_lost()
+                text, number = self._queue[0]
             left = memoryview(torn + text)
+            error = None
             try:
                 while left:
                     left = left[_write_some(self.descriptor, left[:_CHUNK_BYTES]) :]
                     torn = b"\n" if left else b""
                     self._progress += 1
-            except OSError as error:
-                self._failed(error, weight)
-            else:
-                self._full = ""
-            self._noting = _NOTHING
-            if not self._queue:
-                self.on_room()
+            except OSError as failed:
+                error = failed
+            with self._changed:
+                self._queue.popleft()
+                self._bytes -= len(text)
+                if error is None:
+                    self._full = ""
+                    self._note_lost()
+            if error is not None:
+                self._failed(error, number)
 
-    def _failed(self, error: OSError, lost: _Lost) -> None:
+    def _failed(self, error: OSError, lost: int) -> None:
         with self._changed:
             if error.errno not in _FULL:
                 self._gone = True
                 self._queue.clear()
-                self._bytes = 0
                 message = f"{self._name} was closed by its reader; the run goes on without it"
             else:
                 self._full = error.strerror or "the disk is full"
@@ -374,31 +354,18 @@ class Writer:
         self._say(message)
 
 
-class _Lost(NamedTuple):
-    lines: int = 0
-    events: int = 0
-
-    def __add__(self, other: tuple[int, ...]) -> _Lost:  # type: ignore[override]
-        return _Lost(self.lines + other[0], self.events + other[1])
-
-    def __str__(self) -> str:
-        both = ((self.lines, "log line"), (self.events, "event"))
-        parts = [count(number, noun) for number, noun in both if number]
-        return f"{' and '.join(parts)} {'is' if sum(self) == 1 else 'are'}"
-
-
-_NOTHING = _Lost()
+def _lines_are(number: int) -> str:
+    return f"{count(number, 'line')} {'is' if number == 1 else 'are'}"
 
 
 class _Queued(_Raw):
     """The raw end of a stream that a Writer writes."""
 
-    def __init__(self, writer: Writer, *, kept: bool) -> None:
+    def __init__(self, writer: Writer) -> None:
         super().__init__(writer.descriptor)
         self._writer = writer
-        self._kept = kept
 
     def write(self, data: ReadableBuffer) -> int:
         whole = bytes(data)
-        self._writer.put(whole.decode(errors="replace"), kept=self._kept)
+        self._writer.put(whole.decode(errors="replace"), kept=False)
         return len(whole)

@@ -1,4 +1,4 @@
-"""Output of `lifecycle up`: JSON lines, plain lines, or a live table on a terminal.
+"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them.
 
 Owns: the choice between them and the two line formats. Everything comes from the supervisor's
 events.
@@ -6,19 +6,19 @@ events.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import json
-import os
+import shutil
 import sys
-import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import click
 
 from lifecycle.cli.standard_streams import Writer
+from lifecycle.cli.verbs.control import status_head
 from lifecycle.node.host.control import Operation
 from lifecycle.printable import count, json_text, log_line, one_line
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
@@ -41,7 +41,6 @@ from lifecycle.supervisor.run.events import (
     Restarted,
     RestartScheduled,
     RunStarted,
-    StageTimed,
     Stopped,
     Stopping,
     SystemReached,
@@ -56,48 +55,47 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Stage, Verdict
 
+_AGAIN_S = 1.0
 
-class RunOutput(Protocol):
+
+class RunOutput:
     """A listener that also shows how the run ended."""
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
+        raise NotImplementedError
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Take the way to ask for the status, once there is something to show."""
+        """Take the way to ask for the status, once there is something to show; lines need none."""
 
     def finish(self, result: UpResult) -> None:
         """Show the result, and return once that is written or not taken."""
+        raise NotImplementedError
 
 
 @contextlib.contextmanager
-def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
+def output(format_: str) -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
-
-    With `timings_until` it has the time of each stage once the system has come so far.
 
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
+    marker = _json_notice if format_ == "json" else "{}\n".format
+    is_terminal = format_ != "json" and sys.stdout.isatty()
     writer = Writer(
         sys.stdout.fileno(),
         "standard output",
-        marker=_json_notice if format_ == "json" else "{}\n".format,
+        marker="\r\x1b[K{}\n".format if is_terminal else marker,
         say=functools.partial(click.echo, err=True),
         encoding=sys.stdout.encoding,
     )
-    with contextlib.ExitStack() as stack:
-        stack.callback(writer.close)
-        shown: RunOutput
+    with contextlib.closing(writer):
         if format_ == "json":
-            shown = JsonLines(writer)
-        elif sys.stdout.isatty():
-            from lifecycle.cli.live_view import Live  # rich, which nothing else needs
-
-            shown = stack.enter_context(Live(writer=writer))
+            yield JsonLines(writer)
+        elif is_terminal:
+            yield TerminalLines(writer)
         else:
-            shown = PlainLines(writer)
-        yield Timings(shown, until=timings_until) if timings_until else shown
+            yield PlainLines(writer)
 
 
 def _json_line(event: Event) -> str:
@@ -109,14 +107,11 @@ def _json_notice(text: str) -> str:
     return _json_line(Notice(message=text))
 
 
-class JsonLines:
+class JsonLines(RunOutput):
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
@@ -126,103 +121,6 @@ class JsonLines:
         """Write the verdict."""
         self._writer.put(to_json(result.verdict) + "\n")
         self._writer.close()
-
-
-class Timings:
-    """Gives an output how long each stage of bring-up took, once bring-up is over.
-
-    Stages follow each other, but nodes do not wait for each other: a stage is over with the last
-    node, while the first may be two stages further. What was not reached is left out.
-
-    Args:
-        inner: gets every event, and once bring-up is over or has failed a StageTimed a stage.
-        until: the last stage, "connected", "verified" or "active".
-        clock: seconds since the command was started.
-    """
-
-    def __init__(
-        self, inner: RunOutput, *, until: str = "active", clock: Callable[[], float] | None = None
-    ) -> None:
-        self._inner = inner
-        self._until = until
-        self._clock = clock or _since_start()
-        self._over: dict[str, tuple[float, str]] = {}
-        self._come: dict[str, int] = {}
-        self._reached: set[str] = set()
-        self._done = False
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Pass it on."""
-        self._inner.watch(status)
-
-    def finish(self, result: UpResult) -> None:
-        """Pass it on."""
-        self._inner.finish(result)
-
-    def __call__(self, event: Event) -> None:
-        """Note what the event says of a stage, and pass it on."""
-        reached = isinstance(event, SystemReached) and event.reached == self._until
-        timings: tuple[StageTimed, ...] = ()
-        if not self._done:
-            now_s = self._clock()
-            self._note(event, now_s)
-            if reached or isinstance(event, Stopping):
-                self._done = True
-                timings = tuple(self._stages(now_s))
-        for each in (event, *timings) if reached else (*timings, event):
-            self._inner(each)
-
-    def _note(self, event: Event, now_s: float) -> None:
-        if isinstance(event, RunStarted):
-            self._over["supervisor"] = (now_s, "")
-        elif isinstance(event, NodeChanged):
-            before, come = self._come.get(event.node, 0), _COME.get(event.reach, 0)
-            for reach in tuple(_COME)[before:come]:
-                self._over[_COME_BY_NODES[reach]] = (now_s, event.node)
-            self._come[event.node] = come
-        elif isinstance(event, VerdictChanged) and "connected" in self._reached:
-            self._over.setdefault("observed", (now_s, ""))
-        elif isinstance(event, SystemReached):
-            self._reached.add(event.reached)
-            last = self._over.get(event.reached, (now_s, ""))[1]
-            self._over[event.reached] = (now_s, last)
-
-    def _stages(self, now_s: float) -> Iterator[StageTimed]:
-        before_s = 0.0
-        for stage in _STAGES:
-            if stage in self._over:
-                at_s, last = self._over[stage]
-                took_s = max(0.0, at_s - before_s)
-                yield StageTimed(stage=stage, took_s=took_s, elapsed_s=at_s, last=last)
-                before_s = max(before_s, at_s)
-        yield StageTimed(stage="total", took_s=now_s, elapsed_s=now_s)
-
-
-_STAGES = (
-    "supervisor",
-    "processes",
-    "configured",
-    "connected",
-    "observed",
-    "verified",
-    "active",
-)
-"""In their order; the manifest is read and the supervisor's participant made in the first."""
-
-_COME_BY_NODES = {
-    Reach.STARTED: "processes",
-    Reach.CONFIGURED: "configured",
-    Reach.CONNECTED: "connected",
-    Reach.ACTIVE: "active",
-}
-_COME = {reach: number for number, reach in enumerate(_COME_BY_NODES, start=1)}
-
-
-def _since_start() -> Callable[[], float]:
-    """Return what returns for how many seconds this process has run: starttime of proc(5)."""
-    fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    began_s = int(fields[19]) / os.sysconf("SC_CLK_TCK")
-    return lambda: time.clock_gettime(time.CLOCK_BOOTTIME) - began_s
 
 
 class Rollback:
@@ -276,18 +174,17 @@ _LOST = ("unconfigured", "inactive", "finalized", "errorprocessing")
 """States (lifecycle_msgs/State) to which somebody else has brought a node that is to be active."""
 
 
-class PlainLines:
+class PlainLines(RunOutput):
     """One line per event, for logs and pipes."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: Writer, *, colour: bool = False, width: int = 100) -> None:
         self._writer = writer
+        self._colour = colour
+        self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
         self._rollback = Rollback()
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
         """Write one event, if it has a line for people."""
@@ -304,13 +201,59 @@ class PlainLines:
                 return
             self._judged = line
         if line is not None and not hidden:
-            self._writer.put(line + "\n", kept=not isinstance(event, LogLine))
+            self._put(line + "\n", kept=not isinstance(event, LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
         flows = result.verdict.verdict is not Outcome.VIOLATED
-        self._writer.put(render_text(result.verdict, flows=flows))
+        text = render_text(result.verdict, flows=flows, colour=self._colour, width=self._width)
+        self._put(text)
         self._writer.close()
+
+    def _put(self, text: str, *, kept: bool = True) -> None:
+        self._writer.put(text, kept=kept)
+
+
+class TerminalLines(PlainLines):
+    """Lines that scroll above one that says what is going on, redrawn in place."""
+
+    def __init__(self, writer: Writer) -> None:
+        super().__init__(writer, colour=True, width=shutil.get_terminal_size().columns)
+        self._status: Callable[[], SystemStatus] | None = None
+        self._below = ""
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Take the way to ask for what is going on; it is shown each second, as time passes."""
+        self._status = status
+        loop = asyncio.get_running_loop()
+
+        def again() -> None:
+            self._look()
+            if not self._writer.is_behind:
+                self._put("", kept=False)
+            loop.call_later(_AGAIN_S, again)
+
+        again()
+
+    def __call__(self, event: Event) -> None:
+        """Write one event, and what is going on since."""
+        if isinstance(event, SystemReached | VerdictChanged | Stopping):
+            self._look()
+        super().__call__(event)
+
+    def finish(self, result: UpResult) -> None:
+        """Write the verdict in the place of what was going on."""
+        self._below = ""
+        super().finish(result)
+
+    def _look(self) -> None:
+        if self._status is not None:
+            self._width = shutil.get_terminal_size().columns
+            self._below = status_head(self._status())[: self._width - 1]
+
+    def _put(self, text: str, *, kept: bool = True) -> None:
+        # The cursor stays in front of the line, for what others write.
+        self._writer.put(f"\r\x1b[K{text}{self._below}\r", kept=kept)
 
 
 def describe(event: Event) -> str | None:
@@ -381,11 +324,6 @@ def _gate_opened(event: GateOpened) -> str:
     return f"gate open on verdict {event.outcome}: {activating}{trusted}"
 
 
-def _stage_timed(event: StageTimed) -> str:
-    last = f"  last {event.last}" if event.last else ""
-    return f"stage {event.stage:<10}  {event.took_s:7.3f} s  at {event.elapsed_s:7.3f} s{last}"
-
-
 def _failure(event: Failure) -> str:
     # What ends the run comes first in the last verdict; once is enough.
     named = f"failed: {event.subject} ({event.rule})"
@@ -444,7 +382,6 @@ _LINES: dict[type[Event], Callable[[Any], str]] = {
     VerdictChanged: _verdict_changed,
     GateOpened: _gate_opened,
     SystemReached: lambda event: f"system {event.reached} after {event.elapsed_s:.2f} s",
-    StageTimed: _stage_timed,
     Failure: _failure,
     RestartScheduled: _restart_scheduled,
     Restarted: lambda event: (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 from types import FrameType, TracebackType
@@ -11,6 +12,10 @@ from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode
 
 _SIGNALS = {signal.SIGTERM: ExitCode.TERMINATED, signal.SIGHUP: ExitCode.HUNG_UP}
+
+# XTerm Control Sequences: the alternate screen, the cursor, and lines that end at the edge.
+_BEGIN, _END = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
+_HOME, _ERASE_LINE, _ERASE_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 
 
 class Watched:
@@ -23,31 +28,28 @@ class Watched:
     """
 
     def __init__(self, *, whole: bool = True) -> None:
-        self._live = None
+        self._whole = whole and sys.stdout is not None and sys.stdout.isatty()
         self._last = ""
-        if whole and sys.stdout is not None and sys.stdout.isatty():
-            from rich.live import Live  # nothing else of a verb needs rich
-
-            self._live = Live(screen=True, auto_refresh=False, vertical_overflow="crop")
 
     def show(self, text: str) -> None:
         """Show a text in the place of the last one, unless it is the same."""
         if text.rstrip("\n") == self._last:
             return
         self._last = text.rstrip("\n")
-        if self._live is None:
+        if not self._whole:
             echo_while_read(self._last)
-        else:
-            from rich.text import Text
-
-            shown = Text.from_ansi(self._last, no_wrap=True, overflow="crop")
-            self._live.update(shown, refresh=True)
+            return
+        rows = [f"{_ERASE_LINE}{row}" for row in self._last.split("\n")]
+        height = shutil.get_terminal_size().lines
+        if len(rows) < height:
+            rows.append(_ERASE_BELOW)
+        self._write(_HOME + "\n".join(rows[:height]))
 
     def __enter__(self) -> Watched:  # noqa: PYI034 - typing.Self is not in Python 3.10
-        if self._live is not None:
+        if self._whole:
             for number in _SIGNALS:
                 signal.signal(number, _end)
-            self._live.start()
+            self._write(_BEGIN)
         return self
 
     def __exit__(
@@ -56,9 +58,13 @@ class Watched:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._live is not None:
-            self._live.stop()
+        if self._whole:
+            self._write(_END)
             echo_while_read(self._last)
+
+    def _write(self, text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:

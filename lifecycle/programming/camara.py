@@ -46,13 +46,10 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
         url: everything before `/sessions`.
         qos_profiles: the provider's names of profiles, by 5QI.
         duration_s: 1–2147483647; sessions are renewed, or they expire.
-        device_by_token: the access token names the device (three-legged), so that the body must
-            not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
     """
 
     qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
     duration_s: int = 3600
-    device_by_token: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,25 +89,24 @@ class CamaraTarget(ServerTarget):
     settings_type = CamaraSettings
     collection = "/sessions"
 
-    @staticmethod
-    def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
+    def body(self, rule: FlowRule, end: DeviceEnd) -> Body:
         """Return the body of a CreateSession (QualityOnDemand 1.1.0).
 
         It has no protocol and no direction: it treats what goes between a device's ports and a
         server's ports, both ways, UDP and TCP alike.
         """
-        profile = class_name(rule, settings.qos_profiles, setting="qos_profiles")
+        profile = class_name(rule, self._server.qos_profiles, setting="qos_profiles")
         address = {"publicAddress": end.device, "privateAddress": end.device}
         device: Body = {"ipv4Address": address}
         if end.is_ipv6:
             device = {"ipv6Address": end.device}
         return {
-            **({} if settings.device_by_token else {"device": device}),
+            "device": device,
             "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
             "devicePorts": {"ports": [end.device_port]},
             "applicationServerPorts": {"ports": [end.server_port]},
             "qosProfile": profile,
-            "duration": settings.duration_s,
+            "duration": self._server.duration_s,
         }
 
     def create(self, body: Body) -> Made:
@@ -140,7 +136,7 @@ class CamaraTarget(ServerTarget):
         if id_:
             reply = self._api.request("GET", self.path(id_), may_be_gone=True)
             return None if reply.gone else self._made(reply.read(_Session), body)
-        asked = {"device": body["device"]} if "device" in body else {}
+        asked = {"device": body["device"]}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
         for each in () if reply.gone else reply.read(tuple[_Session, ...]):
             if not differs(body, each, _COMPARED, missing=True):
@@ -191,15 +187,15 @@ class CamaraTarget(ServerTarget):
             return math.inf
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
-        return entry.expires_s - self._api.clock.steady_s() - margin_s
+        return entry.expires_s - self._api.patience.steady_s() - margin_s
 
     def _settled(self, session: _Session) -> _Session:
         """Ask until the session is more than requested, for a while."""
         wait_s = _POLL_S
-        deadline_s = self._api.clock.steady_s() + _SETTLED_S
+        deadline_s = self._api.patience.steady_s() + _SETTLED_S
         path = self.path(session.session_id)
         while session.qos_status == "REQUESTED":
-            left_s = deadline_s - self._api.clock.steady_s()
+            left_s = deadline_s - self._api.patience.steady_s()
             if left_s <= 0:
                 break
             self._api.pause(min(wait_s, left_s))
@@ -217,10 +213,10 @@ class CamaraTarget(ServerTarget):
         # The latest that it can end, if nothing says when.
         left_s: float | None = granted
         if session.expires_at is not None:
-            left_s = session.expires_at.timestamp() - self._api.clock.now_s()
+            left_s = session.expires_at.timestamp() - self._api.patience.now_s()
         return Made(
             id=id_,
-            expires_s=None if left_s is None else self._api.clock.steady_s() + left_s,
+            expires_s=None if left_s is None else self._api.patience.steady_s() + left_s,
             detail=detail,
             differs=differs(body, session, _COMPARED),
         )

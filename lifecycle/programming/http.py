@@ -128,7 +128,7 @@ class Api:
 
     Attributes:
         url: what every path is appended to.
-        clock: see Clock.
+        patience: with it.
 
     Raises:
         ProgrammingError: httpx, the extra `networks`, is not installed.
@@ -142,12 +142,10 @@ class Api:
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
-        self.clock = means.clock
         self._is_local = settings.is_local
         self._token = settings.token
         self._timeout_s = settings.timeout_s
-        self._patience = means.patience
-        self._deadline = means.deadline
+        self.patience = means.patience
         self._certificates = httpx.create_ssl_context()
         self._client()  # so that a proxy that cannot be used is an error at once
 
@@ -176,9 +174,9 @@ class Api:
         Raises:
             HttpError: it does.
         """
-        if seconds > self._deadline.left_s():
+        if seconds > self.patience.left_s():
             raise HttpError(f"cannot wait for {self.url}: {self._why_late()}", uncertain=True)
-        self.clock.sleep(seconds, self._deadline.cancelled)
+        self.patience.sleep(seconds)
 
     def request(
         self,
@@ -212,16 +210,16 @@ class Api:
             headers["content-type"] = "application/json"
         content = None if body is None else to_json(body)
         request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
-        wait_s, attempt = self._patience.first_s, 1
-        with self._deadline.within(self._patience.total_s):
+        wait_s, attempt = self.patience.first_s, 1
+        with self.patience.within(self.patience.total_s):
             while True:
                 try:
                     return self._attempt(request, may_be_gone=may_be_gone)
                 except HttpError as error:
-                    pause_s = min(wait_s, self._patience.longest_s)
+                    pause_s = min(wait_s, self.patience.longest_s)
                     pause_s = pause_s if error.after_s is None else error.after_s
-                    left_s = self._deadline.left_s()
-                    if not error.again or attempt == self._patience.attempts:
+                    left_s = self.patience.left_s()
+                    if not error.again or attempt == self.patience.attempts:
                         raise
                     if pause_s >= left_s:
                         # What has failed says more than that there is no time to try again.
@@ -241,7 +239,7 @@ class Api:
             HttpError: refused, or there is no answer that can be read; says whether to ask again.
         """
         what = f"{request.method} {request.url}"
-        limit_s = min(self._timeout_s, self._deadline.left_s())
+        limit_s = min(self._timeout_s, self.patience.left_s())
         if limit_s <= 0:
             raise HttpError(f"cannot {what}: {self._why_late()}")
         sent = False
@@ -256,10 +254,10 @@ class Api:
         if self._token is not None:
             request.headers["authorization"] = f"Bearer {self._token.reveal()}"
         try:
-            reply = self._deadline.run(self._ask(request), limit_s)
+            reply = self.patience.run(self._ask(request), limit_s)
         except TimeoutError:
             reason = f"no {'whole answer' if sent else 'connection'} in time"
-            if self._deadline.cancelled.is_set():
+            if self.patience.cancelled.is_set():
                 reason = self._why_late()
             reason = f"{reason} ({limit_s:.3g} s)"
         except httpx.TransportError as error:
@@ -302,7 +300,7 @@ class Api:
         )
 
     def _why_late(self) -> str:
-        ended = self._deadline.cancelled.is_set()
+        ended = self.patience.cancelled.is_set()
         return "it was ended before it was done" if ended else "no time left"
 
     def _refusal(self, answer: Reply, method: str) -> HttpError:
@@ -328,7 +326,7 @@ class Api:
             status=answer.status,
             uncertain=lost and not twice,
             again=answer.status in _ALWAYS_AGAIN or (lost and twice),
-            after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.clock.now_s()),
+            after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.patience.now_s()),
             hint="check the token and what it is allowed to do" if forbidden else "",
         )
 

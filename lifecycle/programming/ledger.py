@@ -43,7 +43,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
         id: what a server calls it, a subscription or a session; empty while it was asked for and
             is not known to be made.
         what: for people.
-        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
+        expires_s: on the clock of Patience.steady_s; None if it does not expire.
         body: what was written or asked for, of servers as JSON: it finds again what has no id yet.
     """
 

@@ -107,18 +107,17 @@ class NefTarget(ServerTarget):
     settings_type = NefSettings
     collection = "/subscriptions"
 
-    @staticmethod
-    def body(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> Body:
+    def body(self, rule: FlowRule, end: DeviceEnd) -> Body:
         """Return the body of an AsSessionWithQoSSubscription (3GPP TS 29.122 §5.14).
 
         One flow each: a known open implementation passes on only the last of several.
         """
-        reference = class_name(rule, settings.qos_references, setting="qos_references")
+        reference = class_name(rule, self._server.qos_references, setting="qos_references")
         return {
             "supportedFeatures": "0",  # hexadecimal, TS 29.571: none
-            "notificationDestination": settings.notification_destination,
+            "notificationDestination": self._server.notification_destination,
             "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
-            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, settings)]}],
+            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, self._server)]}],
             "qosReference": reference,
         }
 

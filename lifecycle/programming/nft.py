@@ -8,7 +8,6 @@ written: ECN is the transport's (RFC 3168).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from msgspec.structs import replace
 
@@ -54,8 +53,7 @@ class NftTarget(TableTarget):
     def restore(cls, record: TargetRecord) -> None:
         """The ledger's system names the table."""
 
-    @staticmethod
-    def lines(rule: FlowRule, settings: Any) -> Sequence[str]:  # noqa: ARG004 - TableTarget
+    def lines(self, rule: FlowRule) -> Sequence[str]:
         """Return what sets its DSCP and its flow label."""
         found = []
         network = network_of(rule)
@@ -69,21 +67,14 @@ class NftTarget(TableTarget):
         match, flows = flow_match(rule), named(rule)
         return [chain_line(match, statement, f"{mark}: {flows}") for statement, mark in found]
 
-    @staticmethod
-    def wanted(placed: Placed, settings: Any, system: str) -> Wanted:  # noqa: ARG004 - TableTarget
+    def wanted(self, placed: Placed) -> Wanted:
         """Return the table."""
-        return Wanted(render_table(table_name(system), (each for _, of in placed for each in of)))
+        return Wanted(render_table(self._table, (each for _, of in placed for each in of)))
 
-    @staticmethod
-    def script(
-        wanted: Wanted,
-        remarks: Sequence[str],
-        settings: Any,  # noqa: ARG004 - TableTarget
-        system: str,
-    ) -> str:
+    def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
         """Return a ruleset for `nft -f` that replaces the system's table in one transaction."""
         lines = [
-            f"# Marks the verified flows of system {system}. Check without privilege:",
+            f"# Marks the verified flows of system {self._ledger.system}. Check without privilege:",
             "#   unshare -Urn nft -c -f FILE",
             "# Marking alone gives no priority: each hop must also queue by DSCP.",
             *remarks,

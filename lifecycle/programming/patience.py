@@ -1,7 +1,6 @@
-"""How long servers are waited for: the clock, how often is asked again, and when it is over.
+"""How long servers are waited for: how often is asked again, and when it is over.
 
-Owns: `Deadline`, which bounds all that one programmer asks of servers and is cancelled from another
-thread. Knows nothing of HTTP.
+Knows nothing of HTTP.
 """
 
 from __future__ import annotations
@@ -14,15 +13,39 @@ import time
 from collections.abc import Coroutine, Iterator
 from typing import Any, TypeVar
 
-import msgspec
-
 T = TypeVar("T")
 
 _CANCEL_CHECK_S = 0.05
 
 
-class Clock:
-    """The machine's clock; tests have one that need not wait."""
+class Patience:
+    """Bounds all that one programmer asks of servers; without end until `within`.
+
+    One thread works, another cancels.
+
+    Args:
+        attempts: at most so many requests.
+        first_s: wait before the second, then doubled each time.
+        longest_s: longest single wait of our own choice.
+        total_s: one request with all its attempts, and all waits between them; a Retry-After beyond
+            it is not waited for.
+
+    Attributes:
+        cancelled: set while work is to end at once.
+    """
+
+    def __init__(
+        self,
+        *,
+        attempts: int = 5,
+        first_s: float = 0.5,
+        longest_s: float = 8.0,
+        total_s: float = 60.0,
+    ) -> None:
+        self.attempts, self.first_s = attempts, first_s
+        self.longest_s, self.total_s = longest_s, total_s
+        self._until_s = math.inf
+        self.cancelled = threading.Event()
 
     def now_s(self) -> float:
         """Return seconds since the epoch."""
@@ -32,40 +55,9 @@ class Clock:
         """Return seconds since the host was started, on a clock that only goes forward."""
         return time.clock_gettime(time.CLOCK_BOOTTIME)
 
-    def sleep(self, seconds: float, woken: threading.Event) -> None:
-        """Wait, or until `woken` is set."""
-        woken.wait(seconds)
-
-
-class Patience(msgspec.Struct, frozen=True, kw_only=True):
-    """How long to go on asking.
-
-    Attributes:
-        attempts: at most so many requests.
-        first_s: wait before the second, then doubled each time.
-        longest_s: longest single wait of our own choice.
-        total_s: one request with all its attempts, and all waits between them; a Retry-After
-            beyond it is not waited for.
-    """
-
-    attempts: int = 5
-    first_s: float = 0.5
-    longest_s: float = 8.0
-    total_s: float = 60.0
-
-
-class Deadline:
-    """Until when work may go on, and whether it is to end at once; without end until `within`.
-
-    One thread works, another cancels.
-
-    Attributes:
-        cancelled: set while it is to end at once.
-    """
-
-    def __init__(self) -> None:
-        self._until_s = math.inf
-        self.cancelled = threading.Event()
+    def sleep(self, seconds: float) -> None:
+        """Wait, or until it is cancelled."""
+        self.cancelled.wait(seconds)
 
     @contextlib.contextmanager
     def within(self, seconds: float | None) -> Iterator[None]:

@@ -115,7 +115,7 @@ class Removal:
 
     def __init__(self, means: Means) -> None:
         self._ledger = means.ledger
-        self._deadline = means.deadline
+        self._patience = means.patience
         self._means = means
 
     def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
@@ -132,16 +132,16 @@ class Removal:
             kind = target_kind(record.target)
             return kind(kind.restore(record), self._means).remove()
 
-        with self._deadline.within(within_s), self._ledger.locked():
+        with self._patience.within(within_s), self._ledger.locked():
             return _each(self._ledger.read().targets, remove)
 
     def cancel(self) -> None:
         """From another thread: have what servers are asked fail at once, until `resume`."""
-        self._deadline.cancelled.set()
+        self._patience.cancelled.set()
 
     def resume(self) -> None:
         """Ask servers again after a `cancel`."""
-        self._deadline.cancelled.clear()
+        self._patience.cancelled.clear()
 
 
 class Programmer(Removal):
@@ -195,10 +195,14 @@ class Programmer(Removal):
         with self._ledger.locked():
             return tuple(each.plan(rules) for each in self._targets)
 
-    def dry_run(self, flows: Iterable[FlowReport]) -> str:
-        """Return what `update` would send if nothing were there."""
-        rules = self.rules(flows).rules
-        return "\n".join(each.dry_run(rules) for each in self._targets)
+    def export(self, flows: Iterable[FlowReport]) -> str:
+        """Return what targets would be given if nothing were there, as text.
+
+        Raises:
+            ValueError: see `Target.export`.
+        """
+        rules = self.rules(flows)
+        return "".join(each.export(rules) for each in self._targets)
 
     def update(
         self,
@@ -238,7 +242,7 @@ class Programmer(Removal):
             self._programmed |= by_key
             return changes
 
-        with self._deadline.within(within_s), self._ledger.locked():
+        with self._patience.within(within_s), self._ledger.locked():
             try:
                 done = _each(self._targets, apply)
             except LifecycleError:
@@ -251,7 +255,7 @@ class Programmer(Removal):
 
     def renew(self, *, within_s: float | None = None) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
-        with self._deadline.within(within_s), self._ledger.locked():
+        with self._patience.within(within_s), self._ledger.locked():
             due = [each.renew() for each in self._targets]
         return min((each for each in due if each is not None), default=None)
 

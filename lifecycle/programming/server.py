@@ -128,7 +128,7 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         id: what the server calls it.
-        expires_s: on the clock of patience.Clock.steady_s; None if it does not expire.
+        expires_s: on the clock of Patience.steady_s; None if it does not expire.
         detail: for people: "granted for 600 s instead of 3600 s".
         differs: why it is not what was asked for; empty if it is.
     """
@@ -191,11 +191,6 @@ class ServerTarget(Target):
         return frozenset(each.token.env for each in servers if each.token and each.token.env)
 
     @classmethod
-    def export(cls, settings: str, rules: RuleSet, system: str) -> str:  # noqa: ARG003 - Target
-        """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
-        return cls.document(rules, cls._of_file(settings)) + "\n"
-
-    @classmethod
     def _of_file(cls, path: str) -> ServerSettings:
         own = load_settings(path).get(cls.kind)
         if own is None:
@@ -205,10 +200,9 @@ class ServerTarget(Target):
             )
         return own
 
-    @classmethod
-    def document(cls, rules: RuleSet, server: ServerSettings) -> str:
-        """Return requests as JSON for people and scripts: each body beside what it is for."""
-        wanted, left_out = cls.wanted(rules.rules, server)
+    def export(self, rules: RuleSet) -> str:
+        """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
+        wanted, left_out = self._wanted(rules.rules)
         requests = [
             {
                 "key": each.key,
@@ -219,31 +213,26 @@ class ServerTarget(Target):
             for each in wanted
         ]
         left = [*rules.left_out, *left_out]
-        return to_json({cls.collection[1:]: requests, "left_out": left}).decode()
+        return to_json({self.collection[1:]: requests, "left_out": left}).decode() + "\n"
 
-    @classmethod
-    def wanted(
-        cls, rules: Iterable[FlowRule], server: Any
-    ) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
+    def _wanted(self, rules: Iterable[FlowRule]) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
         """Return one request per flow and device, and the flows that none can be made for."""
-        networks = server.networks
 
         def make(rule: FlowRule) -> list[Wanted]:
             return [
                 Wanted(
                     key=f"{rule.key} {'from' if end.sends else 'to'} device",
                     rule=rule,
-                    body=cls.body(rule, end, server),
+                    body=self.body(rule, end),
                 )
-                for end in device_ends(rule, networks)
+                for end in device_ends(rule, self._server.networks)
             ]
 
         made, left_out = expressed(rules, make)
         return tuple(each for _, of in made for each in of), left_out
 
-    @staticmethod
     @abc.abstractmethod
-    def body(rule: FlowRule, end: DeviceEnd, settings: Any) -> Body:
+    def body(self, rule: FlowRule, end: DeviceEnd) -> Body:
         """Return what is asked for one flow and one of its ends that is a device.
 
         Raises:
@@ -278,7 +267,7 @@ class ServerTarget(Target):
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""
-        wanted, left_out = self.wanted(rules, self._server)
+        wanted, left_out = self._wanted(rules)
         changes = tuple(change for change, _ in self._changes(wanted))
         return TargetChanges(target=self.name, changes=changes, left_out=left_out)
 
@@ -288,7 +277,7 @@ class ServerTarget(Target):
         Raises:
             PartlyError: for some flows it failed; the others are done.
         """
-        wanted, left_out = self.wanted(rules, self._server)
+        wanted, left_out = self._wanted(rules)
         return replace(self._carried_out(wanted), left_out=left_out)
 
     def remove(self) -> TargetChanges:

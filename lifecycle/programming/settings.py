@@ -12,7 +12,6 @@ import errno
 import ipaddress
 import os
 import stat
-from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -20,7 +19,8 @@ import msgspec
 import yaml
 
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.target import TARGETS, SettingsError, target_kind
+from lifecycle.programming.names import TARGETS
+from lifecycle.programming.target import SettingsError, target_kind
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
@@ -56,14 +56,14 @@ class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         if bool(self.env) == bool(self.file):
             raise ValueError("cannot find the token: give exactly one of env and file")
 
-    def reveal(self, environment: Mapping[str, str] | None = None) -> str:
+    def reveal(self) -> str:
         """Return the token itself.
 
         Raises:
             SettingsError: it is not there, or is no token; its text is never quoted.
         """
         if self.env:
-            text = (os.environ if environment is None else environment).get(self.env, "")
+            text = os.environ.get(self.env, "")
             where = f"environment variable {self.env}"
         else:
             where = f"file {self.file!r}"

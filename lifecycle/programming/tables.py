@@ -148,27 +148,24 @@ class TableTarget(Target):
         self._table = table
         self._record = TargetRecord(target=self.kind, scope=scope)
 
-    @staticmethod
     @abc.abstractmethod
-    def lines(rule: FlowRule, settings: Any) -> Sequence[str]:
+    def lines(self, rule: FlowRule) -> Sequence[str]:
         """Return the lines of a chain for a rule.
 
         Raises:
             ValueError: there are none, with the reason.
         """
 
-    @staticmethod
     @abc.abstractmethod
-    def wanted(placed: Placed, settings: Any, system: str) -> Wanted:
+    def wanted(self, placed: Placed) -> Wanted:
         """Return what the host is to have.
 
         Raises:
             ValueError: it cannot be had.
         """
 
-    @staticmethod
     @abc.abstractmethod
-    def script(wanted: Wanted, remarks: Sequence[str], settings: Any, system: str) -> str:
+    def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
         """Return the same as a file for people, with these lines of comments."""
 
     def found(self) -> str:
@@ -215,13 +212,12 @@ class TableTarget(Target):
         doing = f"write nft table inet {self._table}"
         demand(self._tool, ["nft", "-f", "-"], doing=doing, stdin=text)
 
-    @classmethod
-    def export(cls, settings: Any, rules: RuleSet, system: str) -> str:
+    def export(self, rules: RuleSet) -> str:
         """Return a file that programs a host, and says in comments what is left out of it."""
-        placed, left_out = expressed(rules.rules, lambda rule: cls.lines(rule, settings))
+        placed, left_out = expressed(rules.rules, self.lines)
         remarks = [f"# {named(each)}: {each.describe()}: {asks(each)}" for each in rules.rules]
         remarks += [f"# left out: {each}" for each in (*rules.left_out, *left_out)]
-        return cls.script(cls.wanted(placed, settings, system), remarks, settings, system)
+        return self.script(self.wanted(placed), remarks)
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare what was written, and what is there, with the rules.
@@ -250,9 +246,9 @@ class TableTarget(Target):
         return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
 
     def _brought(self, rules: Sequence[FlowRule], *, write: bool) -> TargetChanges:
-        placed, left_out = expressed(rules, lambda rule: self.lines(rule, self._settings))
+        placed, left_out = expressed(rules, self.lines)
         try:
-            wanted = self.wanted(placed, self._settings, self._ledger.system)
+            wanted = self.wanted(placed)
         except ValueError as error:
             raise ProgrammingError(str(error)) from error
         entries = tuple(

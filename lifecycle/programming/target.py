@@ -1,8 +1,7 @@
 """What a network target is, which there are, what it changes, and what can go wrong.
 
 Owns: `Target`, which plans, applies and removes; the names of all of them; their answers as text;
-the errors of this package. A target is a module here that has its class as `TARGET`, and one name
-in `TARGETS`; it is imported on first use.
+the errors of this package. A target is imported on first use, see `names`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
-from lifecycle.programming.patience import Clock, Deadline, Patience
+from lifecycle.programming.names import TARGETS
+from lifecycle.programming.patience import Patience
 from lifecycle.programming.rules import FlowRule, RuleSet, asks
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-TARGETS = ("nft", "tc", "nef", "camara")
 
 _TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
 """Targets → options that only they take."""
@@ -105,25 +103,16 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
         return "\n".join(lines)
 
 
-class Means:
+class Means(msgspec.Struct, frozen=True):
     """What targets are opened with.
 
-    Args:
-        ledger: of the system.
-        patience: with servers.
-        clock: for servers.
-
     Attributes:
-        deadline: of everything that the targets ask of servers.
+        ledger: of the system.
+        patience: with servers, of all targets together.
     """
 
-    def __init__(
-        self, ledger: Ledger, *, patience: Patience | None = None, clock: Clock | None = None
-    ) -> None:
-        self.ledger = ledger
-        self.patience = patience or Patience()
-        self.clock = clock or Clock()
-        self.deadline = Deadline()
+    ledger: Ledger
+    patience: Patience = msgspec.field(default_factory=Patience)
 
 
 class Target(abc.ABC):
@@ -169,9 +158,8 @@ class Target(abc.ABC):
             SettingsError: the settings file is gone, or is of another server now.
         """
 
-    @classmethod
     @abc.abstractmethod
-    def export(cls, settings: Any, rules: RuleSet, system: str) -> str:
+    def export(self, rules: RuleSet) -> str:
         """Return what the network would be given, as text, and what is left out of it.
 
         Raises:
@@ -194,10 +182,6 @@ class Target(abc.ABC):
     @abc.abstractmethod
     def remove(self) -> TargetChanges:
         """Delete everything of ours."""
-
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        """Return what would be sent if nothing were there; changes nothing."""
-        return self.export(self._settings, RuleSet(rules=tuple(rules)), self._ledger.system)
 
     def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""

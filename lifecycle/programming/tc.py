@@ -224,19 +224,15 @@ def divide(
             peak, or it queues behind itself.
 
     Raises:
-        ValueError: a rate is not positive, an unknown class has one, or there is not enough.
+        ValueError: an unknown class has a rate, or there is not enough.
     """
     names = [each.name for each in classes]
-    if link_kbit < 1:
-        raise ValueError(f"cannot divide a link of {link_kbit} kbit/s; use 1 or more")
-    for name, rate in guaranteed_kbit.items():
+    for name in guaranteed_kbit:
         if name not in names:
             raise ValueError(
                 f"cannot guarantee a rate to class {name!r}; classes of these rules are: "
                 f"{', '.join(names) or 'none'}"
             )
-        if rate < 1:
-            raise ValueError(f"cannot guarantee {rate} kbit/s to class {name}; use 1 or more")
     every = sorted((*classes, _REST))
     given = {
         each: guaranteed_kbit.get(each.name, max(1, link_kbit // 100))
@@ -342,8 +338,7 @@ class TcTarget(TableTarget):
         """Return the device of a record."""
         return TcSettings(device=record.scope, link_kbit=1)
 
-    @staticmethod
-    def lines(rule: FlowRule, settings: TcSettings) -> Sequence[str]:
+    def lines(self, rule: FlowRule) -> Sequence[str]:
         """Return what puts its packets into their class."""
         class_ = class_of(rule)
         if class_ is None:
@@ -351,33 +346,32 @@ class TcTarget(TableTarget):
                 "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
             )
         matches, comment = [flow_match(rule)], f"{class_.comment}: {named(rule)}"
-        if settings.match is TcMatch.MARK:
+        if self._settings.match is TcMatch.MARK:
             if rule.dscp is None:
                 raise ValueError("it has no DSCP, and rules look at nothing else here")
             matches = [f"{each} dscp {rule.dscp}" for each in ("ip", "ip6")]
             comment = class_.comment
         statement = f"meta priority set {OWNED_HANDLE}{class_.minor:x}"
-        out = f'oifname "{settings.device}"'
+        out = f'oifname "{self._device}"'
         return [chain_line(f"{out} {match}", statement, comment) for match in matches]
 
-    @staticmethod
-    def wanted(placed: Placed, settings: TcSettings, system: str) -> Wanted:
+    def wanted(self, placed: Placed) -> Wanted:
         """Return lines for `tc -batch`, and the table."""
-        device = settings.device
         table = render_table(
-            _table_name(system, device),
+            self._table,
             (each for _, lines in placed for each in lines),
             priority="-149",  # after the marks of the system's own table, which are set at `mangle`
         )
-        qdisc = f"qdisc add dev {device} root handle {OWNED_HANDLE} htb default {DEFAULT_MINOR:#x}"
-        classes = _htb(classes_of(rule for rule, _ in placed), settings)
+        root = f"dev {self._device} root handle {OWNED_HANDLE}"
+        classes = _htb(classes_of(rule for rule, _ in placed), self._settings)
+        qdisc = f"qdisc add {root} htb default {DEFAULT_MINOR:#x}"
         return Wanted(table, beside="\n".join((qdisc, *classes, "")))
 
-    @staticmethod
-    def script(wanted: Wanted, remarks: Sequence[str], settings: TcSettings, system: str) -> str:
+    def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
         """Return a file for `sh FILE` that gives `tc -batch` and `nft -f` their lines."""
+        system = self._ledger.system
         lines = [
-            f"# Queues the verified flows of system {system} on {settings.device}: sh FILE",
+            f"# Queues the verified flows of system {system} on {self._device}: sh FILE",
             *remarks,
             "set -e",
             "tc -batch - <<'END'",

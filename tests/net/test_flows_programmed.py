@@ -121,7 +121,7 @@ def test_flows_are_marked_by_the_rule_and_again_after_a_restart_and_no_more_afte
         bench.take(ups[0])
         assert bench.marks() == ({0}, {0})
 
-        code, text = bench.flows("diff", *nft)
+        code, text = bench.flows("apply", *nft, "--dry-run")
         assert code == ExitCode.VIOLATED, text
         assert "1 to create, 0 unchanged" in text
         code, text = bench.flows("apply", *nft)

@@ -27,7 +27,7 @@ _EF = 46
 _LABELLED = re.compile(
     r"→ \[(?P<address>[0-9a-f:]+)\]:(?P<port>\d+), .*flow label (?P<label>0x[0-9a-f]{5})"
 )
-"""What `up` says of a rule, as `lifecycle flows diff --flow-labels` does."""
+"""What `up` says of a rule, as `lifecycle flows apply --flow-labels` does."""
 
 _ROUNDS = 4
 """Without the order that is asserted, one restart of three sends its first datagram unmarked."""

@@ -6,6 +6,8 @@ Owns: how an order is given and what its outcome is as an exit code; a status as
 from __future__ import annotations
 
 import os
+import shutil
+import sys
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,7 +17,6 @@ from lifecycle.cli.common import (
     assignments_argument,
     format_option,
     machine_option,
-    say_differences,
     target_argument,
     target_arguments,
     target_plan,
@@ -35,53 +36,98 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
     from lifecycle.verify.outcome import ConnectionReport
 
-HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
+_HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
+_BESIDE, _LEAST = 58, 16
+"""Columns that the cells beside a node's name take most often, and that the name keeps."""
+
+_RED, _YELLOW, _PLAIN = "\x1b[31m", "\x1b[33m", "\x1b[0m"
 
 
-def status_text(status: SystemStatus, *, width: int = 0) -> str:
+def status_text(
+    status: SystemStatus, *, width: int = 0, height: int = 0, colour: bool = False
+) -> str:
     """Return a status as lines: system, what was measured, and one for each node and connection.
 
     Args:
         status: of a system.
         width: columns that a line should not pass; 0 wraps none.
+        height: lines of a screen, on which no node is wrapped: where there is no room, nodes that
+            are as they should be are left out; 0 shows all.
+        colour: mark nodes that are not as they should be by ANSI colours.
     """
+    measured = one_line(measured_summary(status.measured))
+    above = [status_head(status), *([measured] if measured else [])]
+    longest = max(_LEAST, width - _BESIDE) if height else 0
+    heads, *rows = columns([_HEADS, *(_row(each, longest) for each in status.nodes)])
+    shown = [
+        [_coloured(line, node) if colour else line, *map(_connection, node.connections)]
+        for line, node in zip(rows, status.nodes, strict=True)
+    ]
+    if not height:
+        return wrapped([*above, heads, *(line for each in shown for line in each)], width)
+    above = [*wrapped(above, width).splitlines(), heads]
+    return "\n".join([*above, *_that_fit(status, shown, height - len(above))])
+
+
+def status_head(status: SystemStatus) -> str:
+    """Return in one line what is going on."""
     verdict = "not judged yet" if status.verdict is None else status.verdict.value
     verdict += f" ({status.not_ok})" if status.not_ok else ""
-    rows = [HEADS, *map(row, status.nodes)]
     living = sum(not node.died and node.next_try_s is None for node in status.nodes)
-    count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
+    number = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     mode = f", mode {status.mode}" if status.mode else ""
     applied = f", revision {status.revision}: {status.manifest}" if status.revision > 1 else ""
     phase = f"{status.phase} ({status.ends})" if status.ends else status.phase
-    head = (
-        f"{status.system}: {phase}{count}{mode}, verdict {verdict}, "
+    return one_line(
+        f"{status.system}: {phase}{number}{mode}, verdict {verdict}, "
         f"domain {status.domain_id}, supervisor {status.supervisor}, "
         f"up for {status.elapsed_s:.1f} s{applied}"
     )
-    text = [one_line(head)]
-    if measured := measured_summary(status.measured):
-        text.append(one_line(measured))
-    for line, node in zip(columns(rows), (None, *status.nodes), strict=True):
-        text.append(line)
-        text += [
-            one_line(f"  {connection_text(each)}") for each in (node.connections if node else ())
-        ]
-    return wrapped(text, width)
 
 
-def connection_text(connection: ConnectionReport) -> str:
+def _that_fit(status: SystemStatus, shown: list[list[str]], height: int) -> list[str]:
+    """Return the lines of as many nodes as fit, those that are not active first, in their order."""
+    if sum(map(len, shown)) <= height:
+        return [line for each in shown for line in each]
+    by_need = sorted(range(len(shown)), key=lambda each: _style(status.nodes[each]) == "")
+    left, kept = height - 1, set[int]()
+    for each in by_need:
+        left -= len(shown[each])
+        if left < 0:
+            break
+        kept.add(each)
+    more = f"… {len(shown) - len(kept)} more nodes: lifecycle status {status.system}"
+    return [*(line for each in sorted(kept) for line in shown[each]), one_line(more)]
+
+
+def _style(node: NodeStatus) -> str:
+    """Return the colour of a node; empty for one that is as it should be."""
+    if node.died or node.findings:
+        return _RED
+    return _YELLOW if node.managed and node.state != "active" else ""
+
+
+def _coloured(line: str, node: NodeStatus) -> str:
+    style = _style(node)
+    return f"{style}{line}{_PLAIN}" if style else line
+
+
+def _connection(connection: ConnectionReport) -> str:
     """Return one connection in one line: what it is, what it is to and what it carries."""
     made = "established" if connection.established else "waits for peers"
     state = f"failed: {connection.error}" if connection.error else made
-    carries = ", ".join(connection.mappings) or "nothing"
-    return f"connection {connection.name} {state}; {', '.join(connection.urls)}; carries {carries}"
+    urls, carries = ", ".join(connection.urls), ", ".join(connection.mappings) or "nothing"
+    return one_line(f"  connection {connection.name} {state}; {urls}; carries {carries}")
 
 
-def row(node: NodeStatus) -> tuple[str, ...]:
-    """Return the cells of a node, below HEADS; printable."""
+def _row(node: NodeStatus, longest: int) -> tuple[str, ...]:
+    """Return the cells of a node, below _HEADS; printable."""
+    name = node.node
+    if longest and len(name) > longest:
+        name = f"…{name[1 - longest :]}"
     process = "not ours" if node.process_state is None else node.process_state.value
     cells = (
-        node.node,
+        name,
         process,
         str(node.pid or "–"),
         "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
@@ -180,10 +226,16 @@ def _watch(path: Path, format_: str) -> int:
     with Watched(whole=not is_json) as shown, asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            text = json_text(to_json(status).decode()) if is_json else ""
-            shown.show(text or status_text(status, width=terminal_width()))
+            shown.show(json_text(to_json(status).decode()) if is_json else _on_screen(status))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
+
+
+def _on_screen(status: SystemStatus) -> str:
+    if not sys.stdout.isatty():
+        return status_text(status)
+    width, height = shutil.get_terminal_size()
+    return status_text(status, width=width, height=height, colour=True)
 
 
 def _list_running(format_: str) -> int:
@@ -222,9 +274,11 @@ def _give_order(
         UsageError: no such run.
         ManifestError: the manifest cannot be loaded.
     """
-    path, plan = target_plan(os.environ, target, assignments, machine)
-    if verb == "pause" and plan is not None:
-        say_differences(path, plan)
+    plan = None
+    if verb == "pause":  # which may be of a manifest that has changed
+        path = target_run(os.environ, target, assignments, machine)
+    else:
+        path, plan = target_plan(os.environ, target, assignments, machine)
     from lifecycle.supervisor.control.client import order
     from lifecycle.supervisor.control.protocol import ControlRequest, Question
 

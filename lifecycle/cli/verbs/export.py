@@ -74,10 +74,11 @@ _WRITTEN_FOR = {
         "`kubectl apply -f FILE` takes it."
     ),
 }
-_CONTAINERS = frozenset(_WRITTEN_FOR) - {"systemd"}
 
 
 def _engine_command(engine: str) -> click.Command:
+    in_image = engine != "systemd"
+
     @manifest_arguments
     @_into("Write a file for each machine there; one of its name is replaced.")
     @click.option(
@@ -85,7 +86,7 @@ def _engine_command(engine: str) -> click.Command:
         default="",
         metavar="PATH",
         help="Where the manifest is when it is started; default: "
-        + ("in the image, /system/NAME." if engine in _CONTAINERS else "where it is here."),
+        + ("in the image, /system/NAME." if in_image else "where it is here."),
     )
     @click.option(
         "--up",
@@ -104,10 +105,10 @@ def _engine_command(engine: str) -> click.Command:
     ) -> int:
         from lifecycle.export.engines import ENGINES, Deployment
 
-        words, timeout_s = _up_options(more, container=engine in _CONTAINERS)
+        words, timeout_s = _up_options(more, container=in_image)
         _check_places(engine, at=at, **rest)
         here = str(Path(manifest).resolve())
-        inside = f"/system/{Path(manifest).name}" if engine in _CONTAINERS else here
+        inside = f"/system/{Path(manifest).name}" if in_image else here
         deployment = Deployment(
             plan=load_plan(manifest, assignments),
             manifest=at or inside,
@@ -124,7 +125,7 @@ def _engine_command(engine: str) -> click.Command:
             _say_secret(word, engine)
         return ExitCode.OK
 
-    if engine in _CONTAINERS:
+    if in_image:
         write = click.option(
             "--image",
             required=True,

@@ -1,18 +1,16 @@
 """`lifecycle flows`: show every network flow, how unique it is and what was measured of it.
 
-Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply`, `diff` and
+Owns: flows as a table, JSON or CSV, `--export`, and the subcommands `apply` and
 `remove`. Exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
+import datetime as dt
 import os
 import shlex
 import sys
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +18,6 @@ import click
 from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import (
-    NETWORKS,
-    F,
     asking,
     assignments_argument,
     export_option,
@@ -30,13 +26,14 @@ from lifecycle.cli.common import (
     load_plan,
     manifest_arguments,
     network_options,
+    read_networks,
     target_argument,
     target_plan,
     terminal_width,
     timeout_option,
     wrapped,
 )
-from lifecycle.cli.measured import Record, cells
+from lifecycle.cli.measured import cells
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
@@ -45,8 +42,9 @@ from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import FlowMeasurement, measured_summary
 from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
+from lifecycle.printable import columns, json_text, lines, one_line, shown_length
 from lifecycle.programming.flows_csv import flows_to_csv
+from lifecycle.programming.names import TARGETS
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
@@ -85,12 +83,13 @@ def render_flows(
     measured: Sequence[FlowMeasurement] = (),
     *,
     colour: bool = False,
+    at: str = "",
 ) -> str:
     """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
 
     In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
     its `tuples`. `transport` is what carries it, not what could. In JSON `measured` is null where
-    nothing was.
+    nothing was. `at` is the time, for a last column of CSV.
     """
     found = {each.pair: each for each in measured}
     flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
@@ -98,7 +97,7 @@ def render_flows(
         documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
         return json_text(to_json(documents).decode())
     if format_ == "csv":
-        return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
+        return lines(flows_to_csv(flows, found, at=at).rstrip("\n"))
     if not flows:
         return "no flow"
     rows = (row for each in flows for row in _rows(each, found.get(each.pair), colour=colour))
@@ -106,10 +105,14 @@ def render_flows(
 
 
 def watched_flows(verdict: Verdict, format_: str) -> str:
-    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first."""
+    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first.
+
+    CSV has the time in its last column.
+    """
     width = terminal_width()
     if format_ != "text" or not width:
-        return render_flows(verdict.flows, format_, verdict.measured)
+        at = dt.datetime.now(dt.timezone.utc).isoformat(timespec="milliseconds")
+        return render_flows(verdict.flows, format_, verdict.measured, at=at)
     from lifecycle.cli.up_output import verdict_line
 
     found, names = {each.pair: each for each in verdict.measured}, _short_names(verdict.flows)
@@ -179,19 +182,21 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-def export(plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment) -> None:
+def export(
+    plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment | None
+) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
         UsageError: it cannot be exported so.
     """
-    rules = _open(plan, (), treatment).rules(flows)
+    programmer = _open(plan, (network,), treatment)
     try:
-        text = network.target.export(network.settings, rules, plan.system)
+        text = programmer.export(flows)
     except ValueError as error:
         raise UsageError(str(error), hint=network.target.hint) from error
     click.echo(text, nl=False)
-    _show_left_out(rules.left_out)
+    _show_left_out(programmer.left_out)
 
 
 _EMPTY_GRAPH_S = 1.5
@@ -218,7 +223,7 @@ class _ShowsByDefault(click.Group):
 @click.group(
     "flows",
     cls=_ShowsByDefault,
-    subcommand_metavar="TARGET [NAME:=VALUE]... | apply|diff|remove MANIFEST ...",
+    subcommand_metavar="TARGET [NAME:=VALUE]... | apply|remove MANIFEST ...",
 )
 def command() -> None:
     """Show every publisher → subscription pair of a running system.
@@ -237,20 +242,6 @@ def command() -> None:
 @assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
-@click.option(
-    "--record",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
-)
-@click.option(
-    "--for",
-    "for_s",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End --record after so long.",
-)
-@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @export_option
 def _show(
@@ -259,25 +250,18 @@ def _show(
     assignments: tuple[str, ...],
     format_: str,
     watch: bool,
-    record: Path | None,
-    for_s: float | None,
-    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
     from lifecycle.supervisor.run import looking
 
-    if record is None and (force or for_s is not None):
-        raise UsageError("cannot use --for or --force without --record FILE")
-    if record is not None and (watch or export_ is not None):
-        raise UsageError("cannot use --record with --watch or --export; run each by itself")
     exported = None
     if export_ is not None:
         if watch:
             raise UsageError("cannot use --export with --watch; export once")
         # What is exported for a network takes what programming it takes.
-        (network,), treatment = _read((export_,), rest, option="--export")
+        (network,), treatment = read_networks((export_,), rest, option="--export")
         exported = (network, treatment)
     elif any(rest.values()):
         raise UsageError(
@@ -285,8 +269,6 @@ def _show(
             hint="give --export, or use lifecycle flows apply",
         )
     plan = _plan_of(target, assignments)
-    if record is not None:
-        return _record(plan, Record(record, replaces=force), for_s)
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
@@ -316,68 +298,34 @@ def _measuring(plan: Plan) -> Path | None:
     return next((each for each in found if each is not None), None)
 
 
+_EACH_S = 1.0
+"""What is measured changes so often."""
+
+
 def _watch(plan: Plan, format_: str) -> int:
     from lifecycle.supervisor.control.server import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
+    is_first = True
     with Watched(whole=format_ == "text") as shown:
+
+        def show(verdict: Verdict) -> None:
+            nonlocal is_first
+            text = watched_flows(verdict, format_)
+            # One table whose head is its first line.
+            shown.show(text.partition("\n")[2] if format_ == "csv" and not is_first else text)
+            is_first = False
+
         if path is None:
-            follow_running(
-                plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
-            )
+            follow_running(plan, lambda seen: show(seen.verdict), each_s=_EACH_S)
             return ExitCode.OK
         with asking(path):
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
-                    shown.show(watched_flows(seen.verdict, format_))
+                    show(seen.verdict)
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
-
-
-_EACH_S = 1.0
-"""What is measured changes so often."""
-
-
-def _record(plan: Plan, record: Record, for_s: float | None) -> int:
-    """Write what is measured each second, until it is over or the supervisor ends."""
-    from lifecycle.supervisor.run.looking import follow_running
-
-    path = _measuring(plan)
-    with contextlib.closing(record):
-        try:
-            if path is not None:
-                _record_supervised(path, record, for_s)
-            else:
-                follow_running(
-                    plan,
-                    lambda seen: record.add(seen.verdict.measured),
-                    each_s=_EACH_S,
-                    for_s=for_s,
-                )
-        finally:
-            click.echo(f"{count(record.rows, 'row')} in {str(record.path)!r}", err=True)
-    return ExitCode.OK
-
-
-def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
-    from lifecycle.supervisor.control.client import status
-
-    began_s = time.monotonic()
-    for number in itertools.count():
-        if for_s is not None and number * _EACH_S >= for_s:
-            return
-        time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
-        try:
-            measured = status(path).measured
-        except TimeoutError:
-            continue  # it is busy; the next one may be answered
-        except UsageError:
-            if number == 0:
-                raise
-            click.echo(f"{path.name}: its supervisor has ended", err=True)
-            return
-        record.add(measured)
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
@@ -402,41 +350,24 @@ def apply(
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
+
+    Returns:
+        VIOLATED of a dry run if a network is not as the verified flows want it.
     """
     from lifecycle.programming.target import PartlyError
 
     programmer = _open(plan, options, treatment)
-    if dry_run:
-        click.echo(programmer.dry_run(flows), nl=False)
-    else:
-        try:
-            _show_changes(programmer.update(flows), done=True)
-        except PartlyError as error:
-            if error.done:
-                path = shlex.quote(plan.manifest_path)
-                error.hint = f"take back what was done: lifecycle flows remove {path}"
-            raise
+    try:
+        changes = programmer.diff(flows) if dry_run else programmer.update(flows)
+    except PartlyError as error:
+        if error.done:
+            path = shlex.quote(plan.manifest_path)
+            error.hint = f"take back what was done: lifecycle flows remove {path}"
+        raise
+    _show_changes(changes, done=not dry_run)
     _show_left_out(programmer.left_out)
-    return ExitCode.OK
-
-
-def diff(
-    plan: Plan,
-    flows: Sequence[FlowReport],
-    options: Sequence[Chosen],
-    *,
-    treatment: Treatment | None = None,
-) -> int:
-    """Say what `apply` would do.
-
-    Returns:
-        VIOLATED if a network is not as the verified flows want it.
-    """
-    programmer = _open(plan, options, treatment)
-    changes = programmer.diff(flows)
-    _show_changes(changes, done=False)
-    _show_left_out(programmer.left_out)
-    return ExitCode.VIOLATED if any(each.pending for each in changes) else ExitCode.OK
+    differs = dry_run and any(each.pending for each in changes)
+    return ExitCode.VIOLATED if differs else ExitCode.OK
 
 
 def remove(plan: Plan) -> int:
@@ -449,17 +380,11 @@ def remove(plan: Plan) -> int:
     return ExitCode.OK
 
 
-def _programming(function: F) -> F:
-    """Add what the subcommands that program networks take."""
-    function = network_options("--target", "Network to program; may be given several times.")(
-        _timeout(function)
-    )
-    return manifest_arguments(function)
-
-
 @command.command("apply")
-@_programming
-@click.option("--dry-run", is_flag=True, help="Print what would be sent.")
+@manifest_arguments
+@network_options("--target", "Network to program; may be given several times.")
+@click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
+@_timeout
 def _apply(
     *,
     manifest: str,
@@ -473,27 +398,17 @@ def _apply(
 
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     """
-    options, treatment = _read(targets, rest)
-    plan, verdict = _judged(manifest, assignments, timeout)
-    done = apply(plan, verdict.flows, options, dry_run=dry_run, treatment=treatment)
-    return done or exit_code(verdict, strict=False)
+    from lifecycle.supervisor.run.looking import judge_running
 
-
-@command.command("diff")
-@_programming
-def _diff(
-    *,
-    manifest: str,
-    assignments: tuple[str, ...],
-    targets: tuple[str, ...],
-    timeout: float,
-    **rest: Any,
-) -> int:
-    """Compare networks with the verified flows; exits with 4 where they differ."""
-    options, treatment = _read(targets, rest)
-    plan, verdict = _judged(manifest, assignments, timeout)
-    differs = diff(plan, verdict.flows, options, treatment=treatment)
-    return differs or exit_code(verdict, strict=False)
+    options, treatment = read_networks(targets, rest, option="--target")
+    if not options:
+        raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
+    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout, strict=False)
+    for each in seen.notices:
+        click.echo(lines(each), err=True)
+    flows = seen.verdict.flows
+    done = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    return done or exit_code(seen.verdict, strict=False)
 
 
 @command.command("remove")
@@ -501,30 +416,6 @@ def _diff(
 def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
     return remove(load_plan(manifest, assignments))
-
-
-def _read(
-    targets: tuple[str, ...], given: Mapping[str, Any], option: str = "--target"
-) -> tuple[tuple[Chosen, ...], Treatment]:
-    """Read the options of networks, and of what flows get, before anything is looked at."""
-    from lifecycle.programming.programmer import read_treatment
-    from lifecycle.programming.target import read_targets
-
-    given = dict(given)
-    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
-    options = read_targets(targets, given, option=option)
-    if not options:
-        raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
-    return options, read_treatment(mapping, label_flows=flow_labels)
-
-
-def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
-    from lifecycle.supervisor.run.looking import judge_running
-
-    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
-    for each in seen.notices:
-        click.echo(lines(each), err=True)
-    return seen.plan, seen.verdict
 
 
 def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:

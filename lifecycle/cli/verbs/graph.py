@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +17,7 @@ from lifecycle.cli.common import (
     target_arguments,
     target_run,
     timeout_option,
+    write_text,
 )
 from lifecycle.cli.watched import Watched
 from lifecycle.errors import ExitCode, UsageError
@@ -68,7 +68,7 @@ def command(
         def draw(picture: Picture) -> None:
             text = render(picture, format_)
             if output is not None:
-                write_picture(output, text)
+                write_text(output, text.rstrip("\n") + "\n")
             else:
                 shown.show(text)
 
@@ -112,25 +112,3 @@ def render(picture: Picture, format_: str) -> str:
     from lifecycle.export.picture import WRITERS
 
     return WRITERS[format_](picture)
-
-
-def write_picture(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old one or the new one, whole.
-
-    What is no regular file, `/dev/null` or a pipe, is written to and stays what it is.
-    """
-    part = None
-    try:
-        if os.path.exists(path) and not os.path.isfile(path):
-            path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
-            return
-        with tempfile.NamedTemporaryFile(
-            "w", dir=path.parent, prefix=f".{path.name}.", encoding="utf-8", delete=False
-        ) as part:
-            part.write(text.rstrip("\n") + "\n")
-        Path(part.name).chmod(0o644)
-        Path(part.name).replace(path.resolve())
-    except OSError as error:
-        if part is not None:
-            Path(part.name).unlink(missing_ok=True)
-        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

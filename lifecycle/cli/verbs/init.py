@@ -131,20 +131,15 @@ def _schemas() -> dict[str, str]:
 @click.command("schema")
 @click.argument("name", default="manifest", metavar="[NAME]")
 @click.option(
-    "--url",
-    is_flag=True,
-    help="Print only where `$schema` finds it: a URL that stays the same for this user.",
-)
-@click.option(
     "--install",
     "to",
     is_flag=False,
     flag_value="",
     type=str,
     metavar="[DIRECTORY]",
-    help="Copy all schemas to DIRECTORY (default: the user's data directory, where --url points).",
+    help="Copy all schemas to DIRECTORY (default: the user's data directory).",
 )
-def schema_command(name: str, *, url: bool, to: str | None) -> int:
+def schema_command(name: str, *, to: str | None) -> int:
     """Print a JSON Schema: of the manifest, or NAME: check, graph, plan or verdict.
 
     Editors complete and explain a manifest that begins with the line which --install prints.
@@ -154,10 +149,7 @@ def schema_command(name: str, *, url: bool, to: str | None) -> int:
         raise UsageError(f"cannot find schema {name!r}; there are: {', '.join(schemas)}")
     if to is not None:
         return _install(schemas, Path(to) if to else None)
-    if url:
-        click.echo((_data_directory() / schemas[name]).as_uri())
-    else:
-        click.echo(_schema_text(schemas[name]).rstrip("\n"))
+    click.echo(_schema_text(schemas[name]).rstrip("\n"))
     return ExitCode.OK
 
 

@@ -6,6 +6,7 @@ Owns: which run and which files are meant, and following them, rotated ones too.
 from __future__ import annotations
 
 import collections
+import contextlib
 import os
 import re
 import time
@@ -30,7 +31,6 @@ _LOOK_S = 0.2
     "--system",
     default="",
     metavar="NAME",
-    shell_complete=None,
     help="Of this system; default: of any.",
 )
 @click.option(
@@ -58,8 +58,7 @@ def command(*, node: str | None, follow: bool, system: str, count: int | None) -
         raise UsageError(
             f"cannot find a run{of} in {str(root)!r}", hint="its logs are where ROS_LOG_DIR says"
         )
-    shown = _followed if follow else _written
-    for line in shown(runs[0], node, count):
+    for line in _lines(runs[0], node, count, follow=follow):
         echo_while_read(line)
     return ExitCode.OK
 
@@ -93,60 +92,43 @@ def _of(lines: Iterable[bytes], logger: str) -> Iterator[bytes]:
             yield line
 
 
-def _missing(run: Path, node: str | None) -> UsageError:
-    there = ", ".join(each.stem for each in sorted(run.glob("*.log"))) or "none"
-    return UsageError(
-        f"cannot find the log of {node!r} in {str(run)!r}; there are: {there}",
-        hint="a node that shares a process is in that process's log",
-    )
-
-
-def _written(run: Path, node: str | None, count: int | None) -> Iterator[str]:
-    """Yield the lines that are there.
+def _lines(run: Path, node: str | None, count: int | None, *, follow: bool) -> Iterator[str]:
+    """Yield the lines that are there; following, also those to come, of files that begin later too.
 
     Raises:
-        UsageError: there is none of the node.
-    """
-    files, logger = _files(run, node)
-    is_there = not logger
-    for path in files:
-        with path.open("rb") as file:
-            lines = collections.deque(_of(file, logger), count)
-        is_there |= bool(lines)
-        yield from _shown(path, lines, several=len(files) > 1 and not logger)
-    if not is_there and node is not None:
-        raise _missing(run, node)
-
-
-def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
-    """Yield the lines that are there and those to come, of files that begin later, too.
-
-    Raises:
-        UsageError: nothing is there, and the run is over.
+        UsageError: nothing is there, and none is to come.
     """
     from lifecycle.supervisor.processes.logs import is_running
 
-    followed: dict[Path, BinaryIO] = {}
+    read = _whole_lines if follow else iter
+    opened: dict[Path, BinaryIO] = {}
     first, is_there = True, False
-    while True:
-        runs = is_running(run)
-        files, logger = _files(run, node)
-        several = node is None or (len(files) > 1 and not logger)
-        for path in files:
-            file = followed.get(path)
-            lines = [] if file is None else list(_of(_whole_lines(file), logger))
-            if file is None or _is_another(file, path):  # it is new, or was rotated
-                file = followed[path] = path.open("rb")
-                new = _of(_whole_lines(file), logger)
-                lines += collections.deque(new, count) if first else new
-            is_there |= bool(lines)
-            yield from _shown(path, lines, several=several)
-        first = first and not files
-        if not runs and not (is_there if logger else files):
-            if node is not None:
-                raise _missing(run, node)
-            return
-        time.sleep(_LOOK_S)
+    with contextlib.ExitStack() as kept:
+        while True:
+            runs = follow and is_running(run)
+            files, logger = _files(run, node)
+            several = node is None or (len(files) > 1 and not logger)
+            for path in files:
+                file = opened.get(path)
+                lines = [] if file is None else list(_of(read(file), logger))
+                if file is None or _is_another(file, path):  # it is new, or was rotated
+                    file = opened[path] = kept.enter_context(path.open("rb"))
+                    new = _of(read(file), logger)
+                    lines += collections.deque(new, count) if first else new
+                is_there |= bool(lines)
+                for line in lines:
+                    text = log_line(line.decode("utf-8", "replace").rstrip("\n"))
+                    yield f"{path.stem} | {text}" if several else text
+            first = first and not files
+            if not runs and not (is_there if logger else files) and node is not None:
+                there = ", ".join(each.stem for each in files) or "none"
+                raise UsageError(
+                    f"cannot find the log of {node!r} in {str(run)!r}; there are: {there}",
+                    hint="a node that shares a process is in that process's log",
+                )
+            if not follow or not (runs or files):
+                return
+            time.sleep(_LOOK_S)
 
 
 def _whole_lines(file: BinaryIO) -> Iterator[bytes]:
@@ -161,10 +143,3 @@ def _is_another(file: BinaryIO, path: Path) -> bool:
         return not os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:
         return False
-
-
-def _shown(path: Path, lines: Iterable[bytes], *, several: bool) -> Iterator[str]:
-    """Yield lines as text, with the process before each where there are several."""
-    for line in lines:
-        text = log_line(line.decode("utf-8", "replace").rstrip("\n"))
-        yield f"{path.stem} | {text}" if several else text

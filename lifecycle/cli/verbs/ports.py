@@ -19,7 +19,6 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
 from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,
-    PLATFORMS,
     Capacity,
     EphemeralRange,
     ParticipantPorts,
@@ -33,8 +32,6 @@ from lifecycle.network.ports import (
     unique_flow_ports,
 )
 from lifecycle.plan.build import effective_domain
-
-THIS = "this"
 
 
 class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,7 +47,6 @@ class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
     participant_id: int
     ports: ParticipantPorts
     overlaps: tuple[PortUse, ...]
-    platform: str
     ephemeral: EphemeralRange
     safe_domains: tuple[tuple[int, int], ...]
     capacity: Capacity
@@ -61,21 +57,17 @@ class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
 @click.command("ports")
 @click.option("--domain", type=int, help="Domain id, 0-232; default: ROS_DOMAIN_ID, else 0.")
 @click.option("--participant", type=int, default=0, show_default=True, help="Counts from 0.")
-@click.option(
-    "--platform",
-    type=click.Choice([*PLATFORMS, THIS]),
-    default=THIS,
-    show_default=True,
-    help="Whose ephemeral ports to keep clear of; `this` reads this machine's own.",
-)
 @format_option("text", "json")
-def command(*, domain: int | None, participant: int, platform: str, format_: str) -> int:
+def command(*, domain: int | None, participant: int, format_: str) -> int:
     """Show the UDP ports of a DDS participant and how many fit.
 
     Whether a manifest's system fits `lifecycle check` says, and `lifecycle plan` which participants
     it has.
     """
-    ephemeral = _ephemeral(platform)
+    try:
+        ephemeral = read_ephemeral_range(lambda path: Path(path).read_text(encoding="ascii"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot tell this machine's ephemeral ports: {error}") from error
     if domain is None:
         domain = effective_domain(Discovery(), os.environ)
     try:
@@ -84,7 +76,6 @@ def command(*, domain: int | None, participant: int, platform: str, format_: str
             participant_id=participant,
             ports=participant_ports(domain, participant),
             overlaps=overlaps(domain, participant),
-            platform=platform,
             ephemeral=ephemeral,
             safe_domains=tuple((run[0], run[-1]) for run in safe_domains(ephemeral)),
             capacity=max_participants(domain, ephemeral),
@@ -95,18 +86,6 @@ def command(*, domain: int | None, participant: int, platform: str, format_: str
         raise UsageError(str(error)) from error
     click.echo(to_json(report).decode() if format_ == "json" else "\n".join(_lines(report)))
     return ExitCode.OK
-
-
-def _ephemeral(platform: str) -> EphemeralRange:
-    if platform != THIS:
-        return PLATFORMS[platform]
-    try:
-        return read_ephemeral_range(lambda path: Path(path).read_text(encoding="ascii"))
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"cannot tell this machine's ephemeral ports: {error}",
-            hint="name a platform, for example --platform linux",
-        ) from error
 
 
 def _lines(report: PortsReport) -> list[str]:
@@ -122,10 +101,9 @@ def _lines(report: PortsReport) -> list[str]:
         f"  unique subscriptions  {first}–{last} (Fast DDS; shared by all domains of a host)",
     ]
     lines += [f"  overlaps with         {_use(each)}" for each in report.overlaps]
-    place = "this machine" if report.platform == THIS else report.platform
     runs = tuple(range(low, high + 1) for low, high in report.safe_domains)
     lines += [
-        f"{place}: ephemeral ports {report.ephemeral}",
+        f"this machine: ephemeral ports {report.ephemeral}",
         f"  safe domains          {describe_domains(runs)}",
         (
             f"  fit in domain {report.domain_id:<8}{capacity.participants} participants per host, "

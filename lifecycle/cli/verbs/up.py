@@ -12,17 +12,17 @@ from lifecycle.cli.common import (
     machine_option,
     manifest_arguments,
     network_options,
+    read_networks,
     timeout_option,
 )
 from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import ExitCode
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult
@@ -56,11 +56,6 @@ if TYPE_CHECKING:
     "--keep-going",
     is_flag=True,
     help="Report a process that dies, but do not take the others down.",
-)
-@click.option(
-    "--timings",
-    is_flag=True,
-    help="Say how long each stage of bring-up took, once it is over or has failed.",
 )
 @click.option(
     "--except",
@@ -99,13 +94,10 @@ def command(
     strict: bool,
     machine: str,
     keep_going: bool,
-    timings: bool,
     without: tuple[str, ...],
     adopt: bool,
     domain: int | None,
     targets: tuple[str, ...],
-    mapping: str,
-    flow_labels: bool,
     **rest: Any,
 ) -> int:
     """Bring a system up: start, configure, connect, verify, and only then activate.
@@ -127,7 +119,7 @@ def command(
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            program = _networks(targets, **rest)
+            program, treatment = read_networks(targets, rest, option="--program")
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
@@ -152,10 +144,9 @@ def command(
                     keep_going=keep_going,
                     adopt=adopt,
                     program=program,
-                    treatment=_treatment(targets, mapping=mapping, flow_labels=flow_labels),
+                    treatment=treatment,
                 )
-                timed = until if timings else ""
-                with output(format_, timings_until=timed) as listener, ending.noted():
+                with output(format_) as listener, ending.noted():
 
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
@@ -195,22 +186,3 @@ def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> Exi
     unwritten = written_or_said(lambda: written.end(result.verdict, result.plan))
     listener.finish(result)
     return result.exit_code or unwritten
-
-
-def _networks(targets: tuple[str, ...], **given: Any) -> tuple[Chosen, ...]:
-    """What programs networks takes long to import, so only where it is asked for."""
-    if not targets and not any(given.values()):
-        return ()
-    from lifecycle.programming.target import read_targets
-
-    return read_targets(targets, given, option="--program")
-
-
-def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
-    if targets:
-        from lifecycle.programming.programmer import read_treatment
-
-        return read_treatment(mapping, label_flows=flow_labels)
-    if mapping or flow_labels:
-        raise UsageError("cannot use --dscp-from-5qi or --flow-labels without --program")
-    return None

@@ -209,23 +209,6 @@ class SystemReached(Event, frozen=True, kw_only=True, tag="system"):
     elapsed_s: float
 
 
-class StageTimed(Event, frozen=True, kw_only=True, tag="stage"):
-    """How long a stage of bring-up took; `up --timings` has one of each once bring-up is over.
-
-    Attributes:
-        stage: "supervisor", "processes", "configured", "connected", "observed", "verified",
-            "active" or "total".
-        took_s: since the stage before it was over; of the total, all of it.
-        elapsed_s: since the command was started.
-        last: name of the node that was the last to come so far, where it was a node's to do.
-    """
-
-    stage: str
-    took_s: float
-    elapsed_s: float
-    last: str = ""
-
-
 class Failure(Event, frozen=True, kw_only=True, tag="failure"):
     """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
 

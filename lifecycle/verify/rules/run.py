@@ -47,7 +47,7 @@ NOT_PROGRAMMED = Rule(
     id="run.not-programmed",
     meaning="a network could not be programmed with the verified flows",
     outcomes=(Outcome.VIOLATED,),
-    fix="see which privilege, program or server is missing; `lifecycle flows diff` tries it alone",
+    fix="see which privilege, program or server is missing; `lifecycle flows apply` tries it alone",
 )
 NOT_WIRED = Rule(
     id="run.not-wired",

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lifecycle.cli.common import NETWORKS
 from lifecycle.cli.verbs import flows as verb
 from lifecycle.cli.verbs import up
+from lifecycle.programming.names import TARGETS
 from lifecycle.programming.programmer import read_treatment
 from lifecycle.programming.target import read_targets
 from lifecycle.verify.verdict import FlowReport
@@ -23,7 +23,7 @@ def export(name: str, *flows: FlowReport, **given: object) -> None:
     verb.export(plan(), flows or [report()], network, read_treatment("", label_flows=False))
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", TARGETS)
 def test_every_export_shows_the_flow_and_names_what_it_left_out(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

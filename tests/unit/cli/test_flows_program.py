@@ -1,4 +1,4 @@
-"""`lifecycle flows apply|diff|remove`: options, dispatch and exit codes, without ROS."""
+"""`lifecycle flows apply|remove`: options, dispatch and exit codes, without ROS."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown() -> None:
     assert "Missing argument 'TARGET'" in run.invoke(flows_verb.command, []).output
     shown = run.invoke(flows_verb.command, ["a.yaml", "--export", "nft", "--watch"])
     assert str(shown.exception) == "cannot use --export with --watch; export once"
-    for verb in ("apply", "diff", "remove"):
+    for verb in ("apply", "remove"):
         assert "MANIFEST" in run.invoke(flows_verb.command, [verb, "--help"]).output
     listed = run.invoke(flows_verb.command, ["--help"]).output
     assert "apply" in listed
@@ -112,20 +112,17 @@ def test_without_httpx_a_server_is_refused_by_the_name_of_the_extra(
 
 
 @pytest.mark.usefixtures("options")
-def test_apply_diff_and_remove_go_together(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_apply_and_remove_go_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with NefServer() as server:
         options = nef_options(tmp_path, server.url)
         flows = [report(), report("/robot/status", source=(nfe("0.0.0.0", 45009),))]
         name = f"nef at {server.url}/3gpp-as-session-with-qos/v1/robots"
 
-        assert flows_verb.diff(plan(), flows, options) is ExitCode.VIOLATED
-        assert flows_verb.apply(plan(), flows, options, dry_run=True) is ExitCode.OK
+        assert flows_verb.apply(plan(), flows, options, dry_run=True) is ExitCode.VIOLATED
         assert server.subscriptions == {}
         assert flows_verb.apply(plan(), flows, options, dry_run=False) is ExitCode.OK
         capsys.readouterr()
-        assert flows_verb.diff(plan(), flows, options) is ExitCode.OK
+        assert flows_verb.apply(plan(), flows, options, dry_run=True) is ExitCode.OK
         out, err = capsys.readouterr()
         assert flows_verb.remove(plan()) is ExitCode.OK
         removed = capsys.readouterr().out

@@ -14,9 +14,9 @@ import click
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.cli.common import write_text
 from lifecycle.cli.report import ReportFile, open_report
 from lifecycle.cli.up_output import output
-from lifecycle.cli.verbs.graph import write_picture
 from lifecycle.cli.verbs.up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
@@ -97,7 +97,7 @@ def _file(path: Path) -> None:
     ("make", "reason"),
     [
         (lambda _: None, "No such file or directory"),
-        (_directory, "it is a directory"),
+        (_directory, "Is a directory"),
         (_file, "Not a directory"),
     ],
 )
@@ -121,7 +121,7 @@ def test_a_full_disk_leaves_a_report_whole_and_red(
     with ReportFile(path) as report:
         report.begin(PLAN)
         before = path.read_text()
-        monkeypatch.setattr(os, "posix_fallocate", full)
+        monkeypatch.setattr(Path, "replace", full)
         with pytest.raises(UsageError, match="No space left on device"):
             report.end(violated())
     assert path.read_text() == before
@@ -261,7 +261,7 @@ def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path
     assert failed[1] > 0
 
 
-def test_a_picture_goes_into_what_is_no_file_and_through_a_link_and_leaves_both(
+def test_a_text_goes_into_what_is_no_file_and_through_a_link_and_leaves_both(
     tmp_path: Path,
 ) -> None:
     pipe, link, file = tmp_path / "pipe", tmp_path / "link", tmp_path / "file"
@@ -270,7 +270,7 @@ def test_a_picture_goes_into_what_is_no_file_and_through_a_link_and_leaves_both(
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     try:
         for each in (pipe, link):
-            write_picture(each, "graph {}")
+            write_text(each, "graph {}\n")
         assert os.read(reader, 100) == b"graph {}\n"
     finally:
         os.close(reader)

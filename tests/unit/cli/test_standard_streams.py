@@ -73,7 +73,7 @@ def test_log_lines_that_nobody_reads_are_dropped_and_counted_and_events_are_kept
         dropped = 2048 - said.count(line)
         assert dropped > 900
         assert said[-1] == (
-            f"<{dropped} log lines are missing here: nobody read standard output in time>\n"
+            f"<{dropped} lines are missing here: nobody read standard output in time>\n"
         )
         writer.put("the last\n")
         writer.close()
@@ -81,7 +81,7 @@ def test_log_lines_that_nobody_reads_are_dropped_and_counted_and_events_are_kept
         assert stream.read() == b"the last\n"
 
 
-def test_the_oldest_events_go_where_there_are_more_than_anybody_could_want() -> None:
+def test_events_are_lost_where_there_are_more_than_anybody_could_want() -> None:
     read, write = os.pipe()
     told: list[str] = []
     writer = Writer(write, "it", marker=lambda text: f"<{text}>\n", say=told.append)
@@ -91,8 +91,7 @@ def test_the_oldest_events_go_where_there_are_more_than_anybody_could_want() -> 
     began = time.monotonic()
     writer.close()  # bounded, though nobody reads
     assert time.monotonic() - began < BOUND_S / 2
-    # One was being written; of the others the newest sixteen waited.
-    assert told == ["19 events are missing at the end of it: nobody read it in time"]
+    assert told == ["20 lines are missing at the end of it: nobody read it in time"]
     os.close(read)
 
 
@@ -115,9 +114,7 @@ def test_a_disk_that_is_full_for_a_while_loses_and_counts_what_came_meanwhile(
     os.dup2(file, there)
     writer.put("four\n")
     writer.close()
-    assert path.read_text() == (
-        "one\n<1 log line and 1 event are missing here: No space left on device>\nfour\n"
-    )
+    assert path.read_text() == ("one\n<2 lines are missing here: No space left on device>\nfour\n")
     assert len(told) == 1
     for each in (file, full, there):
         os.close(each)

@@ -9,12 +9,19 @@ import pytest
 
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode
+from lifecycle.network.ports import LINUX
+
+
+@pytest.fixture(autouse=True)
+def linux(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ephemeral ports as Linux has them by default."""
+    monkeypatch.setattr("lifecycle.cli.verbs.ports.read_ephemeral_range", lambda _: LINUX)
 
 
 def test_the_four_ports_the_safe_domains_and_what_fits_are_printed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    code = main(["ports", "--domain", "101", "--participant", "53", "--platform", "linux"])
+    code = main(["ports", "--domain", "101", "--participant", "53"])
     assert code == ExitCode.OK
     assert (
         capsys.readouterr().out
@@ -25,7 +32,7 @@ domain 101, participant 53
   discovery unicast     32766
   user unicast          32767
   unique subscriptions  7000–7399 (Fast DDS; shared by all domains of a host)
-linux: ephemeral ports 32768–60999
+this machine: ephemeral ports 32768–60999
   safe domains          0–101, 215–232
   fit in domain 101     54 participants per host, then the ephemeral ports 32768–60999
   find each other       33 with 'range: localhost'
@@ -34,7 +41,7 @@ linux: ephemeral ports 32768–60999
 
 
 def test_an_overlap_with_the_next_domain_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["ports", "--domain", "1", "--participant", "120", "--platform", "linux"])
+    main(["ports", "--domain", "1", "--participant", "120"])
     assert capsys.readouterr().out.splitlines()[6:8] == [
         "  overlaps with         discovery multicast of domain 2",
         "  overlaps with         user multicast of domain 2",
@@ -42,22 +49,21 @@ def test_an_overlap_with_the_next_domain_is_named(capsys: pytest.CaptureFixture[
 
 
 def test_json_holds_the_same_for_a_script(capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["ports", "--domain", "166", "--platform", "macos", "--format", "json"])
+    code = main(["ports", "--domain", "2", "--format", "json"])
     assert code == ExitCode.OK
     assert json.loads(capsys.readouterr().out) == {
-        "domain_id": 166,
+        "domain_id": 2,
         "participant_id": 0,
         "ports": {
-            "discovery_multicast": 48900,
-            "user_multicast": 48901,
-            "discovery_unicast": 48910,
-            "user_unicast": 48911,
+            "discovery_multicast": 7900,
+            "user_multicast": 7901,
+            "discovery_unicast": 7910,
+            "user_unicast": 7911,
         },
         "overlaps": [],
-        "platform": "macos",
-        "ephemeral": {"first": 49152, "last": 65535},
-        "safe_domains": [[0, 166]],
-        "capacity": {"participants": 120, "limit": "the ports of domain 167, from 49150"},
+        "ephemeral": {"first": 32768, "last": 60999},
+        "safe_domains": [[0, 101], [215, 232]],
+        "capacity": {"participants": 120, "limit": "the ports of domain 3, from 8150"},
         "localhost_participants": 33,
         "unique_subscription_ports": [7000, 7399],
     }
@@ -66,15 +72,13 @@ def test_json_holds_the_same_for_a_script(capsys: pytest.CaptureFixture[str]) ->
 def test_the_domain_comes_from_the_environment_where_nothing_names_one(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.undo()  # this machine's own ephemeral ports
     monkeypatch.setenv("ROS_DOMAIN_ID", "42")
     main(["ports"])
-    assert capsys.readouterr().out.startswith("domain 42, participant 0\n")
-
-
-def test_this_machines_own_ephemeral_ports_are_read(capsys: pytest.CaptureFixture[str]) -> None:
+    out = capsys.readouterr().out
+    assert out.startswith("domain 42, participant 0\n")
     first, last = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text("ascii").split()
-    main(["ports", "--domain", "0"])
-    assert f"this machine: ephemeral ports {first}–{last}\n" in capsys.readouterr().out
+    assert f"this machine: ephemeral ports {first}–{last}\n" in out
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,6 @@ class FakeTarget:
         changes, self.rules = self.plan(rules), tuple(rules)
         return changes
 
-    def dry_run(self, rules: Sequence[FlowRule]) -> str:
-        return "".join(f"{each.describe()}\n" for each in rules)
-
     def remove(self) -> TargetChanges:
         return self.apply(())
 

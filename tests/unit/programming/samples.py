@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.programming.ledger import Ledger
-from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.rules import FlowRule, RuleSet
+from lifecycle.programming.target import Means, Target
 
 
 def rule(
@@ -40,6 +42,18 @@ def ledger_in(path: Path, system: str = "robot") -> Ledger:
     with ledger.locked():
         pass
     return ledger
+
+
+def exported(
+    kind: type[Target],
+    settings: object,
+    rules: Iterable[FlowRule],
+    system: str = "teleop",
+    left_out: Iterable[str] = (),
+) -> str:
+    """What a target exports of rules."""
+    target = kind(settings, Means(Ledger(Path("unused"), system)))
+    return target.export(RuleSet(rules=tuple(rules), left_out=tuple(left_out)))
 
 
 def settings_file(path: Path, **targets: object) -> str:

@@ -24,6 +24,8 @@ from openapi_core.datatypes import RequestParameters
 from openapi_core.exceptions import OpenAPIError
 from werkzeug.datastructures import Headers, ImmutableMultiDict
 
+from lifecycle.programming.patience import Patience
+
 CAMARA = Path(__file__).parents[2] / "data" / "camara" / "quality-on-demand.yaml"
 TOKEN = "s3cr3t-t0ken-0f-the-t3sts"
 FILTER = re.compile(r"permit (in|out) (6|17|udp|tcp) from [0-9a-f.:]+ [0-9]+ to [0-9a-f.:]+ [0-9]+")
@@ -50,10 +52,11 @@ class Answer:
     type: str = "application/json"
 
 
-class Clock:
+class Clock(Patience):
     """Time that passes only while somebody sleeps."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.now = 1_700_000_000.0
         self.is_set_s = 0.0
         self.slept: list[float] = []
@@ -64,8 +67,8 @@ class Clock:
     def steady_s(self) -> float:
         return self.now
 
-    def sleep(self, seconds: float, woken: threading.Event) -> None:
-        assert not woken.is_set()
+    def sleep(self, seconds: float) -> None:
+        assert not self.cancelled.is_set()
         self.slept.append(seconds)
         self.now += seconds
 

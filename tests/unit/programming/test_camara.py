@@ -43,7 +43,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     clock = Clock()
     with CamaraServer(clock) as server:
         ledger = ledger_in(tmp_path)
-        targets = Means(ledger, clock=clock)
+        targets = Means(ledger, clock)
 
         def make(**settings: object) -> Target:
             file = settings_file(tmp_path, camara=camara_settings(server.url, **settings))
@@ -81,12 +81,6 @@ def test_ipv6_devices_and_servers_are_asked_for_as_such(bench: Bench) -> None:
 
     assert bench.session["device"] == {"ipv6Address": "2001:db8:45::3"}
     assert bench.session["applicationServer"] == {"ipv6Address": "2001:db8:99::7"}
-
-
-def test_a_token_that_names_the_device_leaves_it_out_of_the_body(bench: Bench) -> None:
-    bench.make(device_by_token=True).apply([rule()])
-
-    assert "device" not in bench.server.asked[0].body
 
 
 def test_a_port_that_changed_ends_the_old_session_before_the_new_one(bench: Bench) -> None:

@@ -277,7 +277,7 @@ def target_at(
     path: Path, kind: str, server: HostileServer, patience: Patience | None = None
 ) -> Iterator[tuple[Target, Means]]:
     quick = patience or Patience(attempts=2, first_s=0.01, total_s=4 * _TIMEOUT_S)
-    targets = Means(ledger_in(path), patience=quick)
+    targets = Means(ledger_in(path), quick)
     settings = {"nef": nef_settings, "camara": camara_settings}[kind](
         server.url, timeout_s=_TIMEOUT_S
     )
@@ -364,10 +364,10 @@ def test_a_session_whose_state_cannot_be_read_stays_listed_so_that_it_is_removed
     assert [each.id for each in record.entries] == [""]
 
 
-def _programmer(path: Path, server: HostileServer, patience: Patience) -> Programmer:
+def _programmer(path: Path, server: HostileServer) -> Programmer:
     """One that would be patient for far longer than any test."""
     ledger = ledger_in(path, "s")
-    targets = Means(ledger, patience=patience)
+    targets = Means(ledger, Patience(attempts=1000, first_s=0.05, total_s=600))
     settings = nef_settings(server.url, devices=["10.77.0.1"], timeout_s=60)
     file = settings_file(path, nef=settings)
     target = read_targets(["nef"], {"config": file})[0].open(targets)
@@ -375,7 +375,6 @@ def _programmer(path: Path, server: HostileServer, patience: Patience) -> Progra
 
 
 _VERDICT = Verdict(verdict=Outcome.OK, blocking=False, findings=(), flows=(report(),))
-_ENDLESS = Patience(attempts=1000, first_s=0.05, total_s=600)
 
 
 @pytest.mark.parametrize(
@@ -385,7 +384,7 @@ _ENDLESS = Patience(attempts=1000, first_s=0.05, total_s=600)
 )
 def test_a_bring_up_waits_for_no_server_past_its_deadline(behave: Behave, tmp_path: Path) -> None:
     async def run() -> BringUpError:
-        networks = Networks("s", tmp_path, Emitter(), _programmer(tmp_path, server, _ENDLESS))
+        networks = Networks("s", tmp_path, Emitter(), _programmer(tmp_path, server))
         with pytest.raises(BringUpError) as caught:
             await networks.begin(_VERDICT, 0.5)
         hurry = asyncio.Event()
@@ -404,7 +403,7 @@ def test_a_bring_up_waits_for_no_server_past_its_deadline(behave: Behave, tmp_pa
 
 def test_cancelling_a_bring_up_ends_a_request_at_once(tmp_path: Path) -> None:
     async def run() -> None:
-        programmer = _programmer(tmp_path, server, _ENDLESS)
+        programmer = _programmer(tmp_path, server)
         networks = Networks("s", tmp_path, Emitter(), programmer)
         beginning = asyncio.ensure_future(networks.begin(_VERDICT, 600.0))
         assert await asyncio.to_thread(server.came.wait, _BOUND_S)
@@ -428,7 +427,7 @@ def test_whoever_hurries_waits_for_no_server_and_is_told_that_it_is_still_listed
     async def run() -> None:
         emit = Emitter()
         emit.listen(note)
-        networks = Networks("s", tmp_path, emit, _programmer(tmp_path, server, _ENDLESS))
+        networks = Networks("s", tmp_path, emit, _programmer(tmp_path, server))
         await networks.begin(_VERDICT, 600.0)
         server._behave = _silent
         server.came.clear()
@@ -472,7 +471,7 @@ class TestProxies:
         with HostileServer(answers({}, "502 Proxy")) as proxy:
             monkeypatch.setenv("HTTPS_PROXY", proxy.url)
             ledger = ledger_in(tmp_path)
-            targets = Means(ledger, patience=Patience(attempts=1))
+            targets = Means(ledger, Patience(attempts=1))
             file = settings_file(tmp_path, nef=nef_settings("https://nef.invalid", timeout_s=5))
             with pytest.raises(PartlyError):
                 read_targets(["nef"], {"config": file})[0].open(targets).apply([rule()])

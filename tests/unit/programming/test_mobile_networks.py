@@ -8,15 +8,19 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from types import SimpleNamespace
+from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from lifecycle.programming.camara import CamaraSettings, CamaraTarget
 from lifecycle.programming.nef import NefSettings, NefTarget
-from lifecycle.programming.rules import RuleSet
+from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.settings import ServerSettings
 from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO, rule
+from tests.unit.programming.samples import exported, settings_file
 
 ROBOT, VIEWER = "10.9.0.1", "10.9.0.2"
 IPV6 = rule("/lidar", "fd09::1:17904", "fd09::2:17914", five_qi=85)
@@ -42,14 +46,24 @@ def camara(**rest: object) -> CamaraSettings:
     return CamaraSettings(**{**ordinary, **rest})
 
 
-def nef_subscriptions(rules: object, settings: NefSettings) -> SimpleNamespace:
-    requests, left_out = NefTarget.wanted(rules, settings)
-    return SimpleNamespace(requests=requests, left_out=left_out)
+@pytest.fixture
+def asked(tmp_path: Path) -> Callable[..., dict[str, Any]]:
+    """What a NEF, or another server, is asked for some rules, and what is left out."""
+
+    def ask(
+        *rules: FlowRule, settings: ServerSettings | None = None, left_out: tuple[str, ...] = ()
+    ) -> dict[str, Any]:
+        settings = settings or nef()
+        kind = NefTarget if isinstance(settings, NefSettings) else CamaraTarget
+        file = settings_file(tmp_path, **{kind.kind: msgspec.to_builtins(settings)})
+        return json.loads(exported(kind, file, rules, left_out=left_out))
+
+    return ask
 
 
-def reasons(found: object) -> list[str]:
-    assert found.requests == ()
-    return [each.partition(": ")[2] for each in found.left_out]
+def reasons(found: dict[str, Any]) -> list[str]:
+    assert found["subscriptions"] == []
+    return [each.partition(": ")[2] for each in found["left_out"]]
 
 
 # --- NEF
@@ -60,12 +74,15 @@ def filters(body: dict[str, object]) -> list[str]:
     return flow["flowDescriptions"]
 
 
-def test_a_flow_between_two_devices_is_asked_for_once_for_each() -> None:
-    found = nef_subscriptions([IPV6], nef())
-    assert [
-        (each.key.rpartition("udp ")[2], each.body["ueIpv6Addr"]) for each in found.requests
-    ] == [("fd09::2 to device", "fd09::2"), ("fd09::2 from device", "fd09::1")]
-    assert [filters(each.body) for each in found.requests] == [
+def test_a_flow_between_two_devices_is_asked_for_once_for_each(
+    asked: Callable[..., dict[str, Any]],
+) -> None:
+    found = asked(IPV6)["subscriptions"]
+    assert [(each["key"].rpartition("udp ")[2], each["body"]["ueIpv6Addr"]) for each in found] == [
+        ("fd09::2 to device", "fd09::2"),
+        ("fd09::2 from device", "fd09::1"),
+    ]
+    assert [filters(each["body"]) for each in found] == [
         ["permit out 17 from fd09::1 17904 to fd09::2 17914"],
         ["permit in 17 from fd09::1 17904 to fd09::2 17914"],
     ]
@@ -79,11 +96,12 @@ def test_a_flow_between_two_devices_is_asked_for_once_for_each() -> None:
     ],
 )
 def test_servers_differ_in_how_they_want_what_a_device_sends(
-    change: dict[str, object], text: str
+    asked: Callable[..., dict[str, Any]], change: dict[str, object], text: str
 ) -> None:
-    (request,) = nef_subscriptions([VIDEO], nef(devices=(ROBOT,), **change)).requests
-    assert filters(request.body) == [text]
-    assert request.body["ueIpv4Addr"] == ROBOT
+    settings = nef(devices=(ROBOT,), **change)
+    (request,) = asked(VIDEO, settings=settings)["subscriptions"]
+    assert filters(request["body"]) == [text]
+    assert request["body"]["ueIpv4Addr"] == ROBOT
 
 
 @pytest.mark.parametrize(
@@ -109,22 +127,23 @@ def test_servers_differ_in_how_they_want_what_a_device_sends(
     ],
 )
 def test_what_cannot_be_asked_for_is_named_with_its_reason(
-    change: dict[str, object], reason: str
+    asked: Callable[..., dict[str, Any]], change: dict[str, object], reason: str
 ) -> None:
-    changed = replace(VIDEO, **change)
-    assert reasons(nef_subscriptions([changed], nef())) == [reason]
+    assert reasons(asked(replace(VIDEO, **change))) == [reason]
 
 
-def test_the_export_says_what_each_body_is_for() -> None:
-    made = json.loads(NefTarget.document(RuleSet(rules=RULES, left_out=LEFT_OUT), nef()))
+def test_the_export_says_what_each_body_is_for(asked: Callable[..., dict[str, Any]]) -> None:
+    made = asked(*RULES, left_out=LEFT_OUT)
     assert made == json.loads((EXPECTED / "nef.json").read_text(encoding="utf-8"))
 
 
 # --- CAMARA
 
 
-def test_the_camara_export_says_what_each_body_is_for() -> None:
-    made = json.loads(CamaraTarget.document(RuleSet(rules=RULES, left_out=LEFT_OUT), camara()))
+def test_the_camara_export_says_what_each_body_is_for(
+    asked: Callable[..., dict[str, Any]],
+) -> None:
+    made = asked(*RULES, settings=camara(), left_out=LEFT_OUT)
     assert made == json.loads((EXPECTED / "camara.json").read_text(encoding="utf-8"))
 
 

@@ -12,6 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.programming.ledger import Ledger
+from lifecycle.programming.rules import RuleSet
 from lifecycle.programming.target import (
     ChangeKind,
     Means,
@@ -49,7 +50,7 @@ def made(tmp_path: Path, server: NefServer) -> Bench:
     ledger = ledger_in(tmp_path)
     clock = Clock()
     file = settings_file(tmp_path, nef=nef_settings(server.url))
-    targets = Means(ledger, clock=clock)
+    targets = Means(ledger, clock)
 
     def make() -> Target:
         return read_targets(["nef"], {"config": file})[0].open(targets)
@@ -314,6 +315,6 @@ def test_the_token_is_in_requests_and_nowhere_else(
         traceback.TracebackException.from_exception(caught.value, capture_locals=True).format()
     )
     files = [each.read_text() for each in tmp_path.rglob("*") if each.is_file()]
-    dump = bench.target.dry_run([rule()])
+    dump = bench.target.export(RuleSet(rules=(rule(),)))
     for text in (caplog.text, trace, dump, repr(vars(bench.target)), *files):
         assert TOKEN not in text

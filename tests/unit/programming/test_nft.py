@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import MAX_DSCP
 from lifecycle.programming.nft import NftTarget
-from lifecycle.programming.rules import FlowRule, RuleSet
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.tables import MAX_COMMENT_BYTES, render_table_removal, table_name
 from tests.unit.programming.flow_samples import (
     EXPECTED,
@@ -20,10 +20,11 @@ from tests.unit.programming.flow_samples import (
     VIDEO,
     in_a_network_namespace,
 )
+from tests.unit.programming.samples import exported
 
 
 def ruleset(*rules: FlowRule, left_out: tuple[str, ...] = ()) -> str:
-    return NftTarget.export(None, RuleSet(rules=rules, left_out=left_out), "teleop")
+    return exported(NftTarget, None, rules, left_out=left_out)
 
 
 def test_a_ruleset_is_one_table_that_is_replaced_in_one_transaction() -> None:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from lifecycle.programming.nft import NftTarget
-from lifecycle.programming.rules import RuleSet
 from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget
 from tests.unit.programming.flow_samples import in_a_network_namespace, rule
+from tests.unit.programming.samples import exported
 
 RULES = (
     rule("/video", "127.0.0.1:17900", "127.0.0.1:17910", dscp=46),
@@ -58,9 +58,7 @@ def run(script: str, needs: str) -> str:
 def test_marked_flows_carry_their_dscp_keep_their_ecn_and_others_stay_as_they_are(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "nft").write_text(
-        NftTarget.export(None, RuleSet(rules=RULES), "wire"), encoding="utf-8"
-    )
+    (tmp_path / "nft").write_text(exported(NftTarget, None, RULES, "wire"), encoding="utf-8")
     (tmp_path / "send.py").write_text(SENDER, encoding="utf-8")
     out = run(
         f"""set -e
@@ -90,12 +88,8 @@ def test_each_flow_goes_to_its_class_and_the_rest_to_the_rest(
     tmp_path: Path, match: TcMatch
 ) -> None:
     settings = TcSettings(device="lo", link_kbit=100_000, match=match)
-    (tmp_path / "tc").write_text(
-        TcTarget.export(settings, RuleSet(rules=RULES), "wire"), encoding="utf-8"
-    )
-    (tmp_path / "nft").write_text(
-        NftTarget.export(None, RuleSet(rules=RULES), "wire"), encoding="utf-8"
-    )
+    (tmp_path / "tc").write_text(exported(TcTarget, settings, RULES, "wire"), encoding="utf-8")
+    (tmp_path / "nft").write_text(exported(NftTarget, None, RULES, "wire"), encoding="utf-8")
     (tmp_path / "send.py").write_text(SENDER, encoding="utf-8")
     # Marks are set before packets are queued, so nft and tc work together on one host.
     out = run(

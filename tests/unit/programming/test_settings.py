@@ -97,8 +97,9 @@ def test_a_file_that_is_not_there_is_one_clear_error() -> None:
 
 
 def test_a_token_comes_from_the_environment_or_a_file_at_the_moment_it_is_used(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("T", " abc ")
     file = tmp_path / "token"
     file.write_text("first\n")
     token = Token(file=str(file))
@@ -106,18 +107,21 @@ def test_a_token_comes_from_the_environment_or_a_file_at_the_moment_it_is_used(
     assert token.reveal() == "first"
     file.write_text("rotated\n")
     assert token.reveal() == "rotated"
-    assert Token(env="T").reveal({"T": " abc "}) == "abc"
+    assert Token(env="T").reveal() == "abc"
     assert "rotated" not in repr(token)
 
 
 @pytest.mark.parametrize("text", ["", "  \n", "two words", "a\r\nX-Evil: 1", "hunter2é"])
-def test_what_is_no_token_is_refused_without_being_quoted(text: str, tmp_path: Path) -> None:
+def test_what_is_no_token_is_refused_without_being_quoted(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("T", text)
     file = tmp_path / "token"
     file.write_text(text, encoding="utf-8")
 
-    for token, environment in ((Token(env="T"), {"T": text}), (Token(file=str(file)), None)):
+    for token in (Token(env="T"), Token(file=str(file))):
         with pytest.raises(SettingsError, match="the token from") as caught:
-            token.reveal(environment)
+            token.reveal()
         for part in ("hunter2", "words", "Evil"):
             assert part not in str(caught.value)
 

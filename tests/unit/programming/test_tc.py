@@ -8,9 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
-from lifecycle.programming.rules import RuleSet
 from lifecycle.programming.tc import TcMatch, TcSettings, TcTarget, class_of, classes_of, divide
 from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO
+from tests.unit.programming.samples import exported
 
 
 def settings(**rest: object) -> TcSettings:
@@ -28,7 +28,7 @@ def cannot(message: str) -> object:
 
 
 def script(case: TcSettings) -> str:
-    return TcTarget.export(case, RuleSet(rules=RULES, left_out=LEFT_OUT), "teleop")
+    return exported(TcTarget, case, RULES, left_out=LEFT_OUT)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -71,7 +71,6 @@ def test_a_link_is_divided_without_remainder_lost_or_spent_twice() -> None:
 @pytest.mark.parametrize(
     ("link", "guaranteed", "message"),
     [
-        (0, {}, "cannot divide a link of 0 kbit/s; use 1 or more"),
         (
             20_000,
             {"af41": 1},
@@ -80,7 +79,6 @@ def test_a_link_is_divided_without_remainder_lost_or_spent_twice() -> None:
                 "classes of these rules are: ef, nqb, dscp5, 5qi9, le"
             ),
         ),
-        (20_000, {"ef": 0}, "cannot guarantee 0 kbit/s to class ef; use 1 or more"),
         (
             20_000,
             {"ef": 20_000},

@@ -1,4 +1,4 @@
-"""What a run looks like: plain lines, JSON lines, the live table, status and flows."""
+"""What a run looks like: plain lines, JSON lines, a terminal, status and flows."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from rich.console import Console
 
-from lifecycle.cli.live_view import Live
-from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, Timings
+from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, TerminalLines
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows, watched_flows
 from lifecycle.errors import ExitCode
@@ -41,7 +39,7 @@ from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
 from tests.builders import nfe, node, publisher
 from tests.builders import planned as planned_of
-from tests.unit.supervisor.fakes import run_started, verdict_of
+from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
     ProcessChanged(process="camera", state=ProcessState.RUNNING, pid=7),
@@ -105,6 +103,8 @@ FLOW = FlowReport(
 class Into(io.StringIO):
     """A sink that takes everything at once."""
 
+    is_behind = False
+
     def put(self, text: str, *, kept: bool = True) -> None:
         self.write(text)
 
@@ -129,21 +129,19 @@ def written(
     return into.lines
 
 
-def live(
-    *events: Event, status: SystemStatus = STATUS, finish: UpResult | None = None, **size: int
-) -> str:
-    """Return all that the live table shows."""
-    stream = io.StringIO()
-    console = Console(file=stream, force_terminal=True, color_system=None, **{"width": 100, **size})
-    with Live(console) as shown:
-        shown.watch(lambda: status)
-        for each in events:
-            shown(each)
-        if finish is not None:
-            stream.seek(0)
-            stream.truncate()
-            shown.finish(finish)
-    return stream.getvalue()
+async def on_terminal(
+    *events: Event, status: SystemStatus = STATUS, finish: UpResult | None = None
+) -> list[str]:
+    """Return what a terminal shows in the end, line for line."""
+    into = Into()
+    output = TerminalLines(into)
+    output.watch(lambda: status)
+    for each in events:
+        output(each)
+    if finish is not None:
+        output.finish(finish)
+    text = re.sub(r"\x1b\[\d*m", "", into.getvalue())
+    return [row.rpartition("\x1b[K")[2].strip("\r") for row in text.split("\n")]
 
 
 # Lines
@@ -167,64 +165,12 @@ def test_lines_are_what_happens_for_people_and_one_object_each_for_programs() ->
     assert lines[-1]["verdict"] == "ok"
 
 
-def test_a_stage_is_over_with_the_last_node_that_came_so_far() -> None:
-    def judged(outcome: Outcome) -> Event:
-        return VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(outcome))
-
-    came = (
-        (0.5, run_started("/camera", "/arm")),
-        (1.0, NodeChanged(node="/camera", reach=Reach.STARTED)),
-        (1.2, NodeChanged(node="/camera", reach=Reach.CONNECTED)),
-        (1.5, NodeChanged(node="/arm", reach=Reach.STARTED)),
-        (1.6, NodeChanged(node="/arm", reach=Reach.CONFIGURED)),
-        (1.7, judged(Outcome.VIOLATED)),
-        (2.0, NodeChanged(node="/arm", reach=Reach.CONNECTED)),
-        (2.0, SystemReached(reached="connected", elapsed_s=1.5)),
-        (2.25, judged(Outcome.VIOLATED)),
-        (2.5, judged(Outcome.OK)),
-        (3.0, SystemReached(reached="verified", elapsed_s=2.5)),
-        (3.25, NodeChanged(node="/arm", reach=Reach.ACTIVE)),
-        (3.5, NodeChanged(node="/camera", reach=Reach.ACTIVE)),
-        (4.0, SystemReached(reached="active", elapsed_s=3.5)),
-    )
-    text, records = Into(), Into()
-    for output in (PlainLines(text), JsonLines(records)):
-        times = iter([at_s for at_s, _ in came])
-        timings = Timings(output, until="active", clock=lambda times=times: next(times))  # type: ignore[misc]
-        for _, event in came:
-            timings(event)
-    assert [line for line in text.lines if line.startswith("stage")] == [
-        "stage supervisor    0.500 s  at   0.500 s",
-        "stage processes     1.000 s  at   1.500 s  last /arm",
-        "stage configured    0.100 s  at   1.600 s  last /arm",
-        "stage connected     0.400 s  at   2.000 s  last /arm",
-        "stage observed      0.250 s  at   2.250 s",
-        "stage verified      0.750 s  at   3.000 s",
-        "stage active        1.000 s  at   4.000 s  last /camera",
-        "stage total         4.000 s  at   4.000 s",
-    ]
-    stages = [each for each in map(json.loads, records.lines) if each["event"] == "stage"]
-    assert stages[1] == {
-        "event": "stage",
-        "stage": "processes",
-        "took_s": 1.0,
-        "elapsed_s": 1.5,
-        "last": "/arm",
-    }
-
-
 def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_the_cause() -> None:
     def says(process: str, line: str) -> LogLine:
         return LogLine(process=process, stream="stderr", line=line)
 
     def said(*events: Event) -> list[str]:
-        stream = io.StringIO()
-        table = Live(Console(file=stream, width=100, force_terminal=False))
-        for event in events:
-            table(event)
-        lines = [each for each in written(PlainLines, *events) if each.startswith("[")]
-        assert [each for each in stream.getvalue().splitlines() if each.startswith("[")] == lines
-        return lines
+        return [each for each in written(PlainLines, *events) if each.startswith("[")]
 
     ends = [
         ProcessChanged(process=each, state=ProcessState.STOPPING) for each in ("camera", "viewer")
@@ -277,31 +223,32 @@ def test_states_on_the_way_down_have_no_lines_and_those_that_others_cause_have()
     ]
 
 
-# The live table
+# A terminal
 
 
-def test_the_live_table_shows_each_node_scrolls_what_it_prints_and_ends_with_the_verdict() -> None:
-    shown = live(*EVENTS)
-    assert "[camera] shutter is open" in shown
-    assert "connecting ▸ verifying ▸ activating ▸ measuring ▸ active" in shown
-    row = next(line for line in shown.splitlines() if line.strip().startswith("/camera "))
-    assert row.split() == ["/camera", "running", "7", "active", "1/2", "1/3"]
+async def test_a_terminal_shows_lines_below_them_what_goes_on_and_in_the_end_the_verdict() -> None:
+    head = "robot: active, verdict ok, domain 30, supervisor 1, up for 1.5 s"
+    lines = written(PlainLines, *EVENTS)
+    assert await on_terminal(*EVENTS) == [*lines, head]
     violated = UpResult(exit_code=ExitCode.VIOLATED, verdict=verdict_of(Outcome.VIOLATED))
-    last = live(EVENTS[4], finish=violated)
-    assert ("verdict: violated" in last, "verdict ok" in last) == (True, False)
+    shown = await on_terminal(*EVENTS, finish=violated)
+    assert shown[: len(lines)] == lines
+    assert (shown[len(lines)], head in shown) == ("verdict: violated", False)
+    why = "wrong: " + ", ".join(f"/node_{number}" for number in range(99))
+    assert len((await on_terminal(status=replace(STATUS, not_ok=why)))[-1]) == 79
 
 
 @pytest.mark.parametrize("count", [3, 60])
-def test_the_live_table_fits_the_terminal(count: int) -> None:
+def test_a_status_fits_the_screen(count: int) -> None:
     nodes = [replace(NODE, node=f"/{'n' * 90}_{number}") for number in range(count)]
     nodes[-1] = replace(NODE, node="/late", state="inactive")
-    shown = live(status=replace(STATUS, nodes=tuple(nodes)), width=80, height=24)
-    rows = [re.sub(r"\x1b\[[?\d]*[a-zA-Z]", "", row) for row in shown.split("\n")]
-    assert len(rows) <= 24 * 2  # drawn twice: at the start and in the end
-    assert max(map(len, rows)) <= 81
-    late = next(row for row in rows if row.strip().startswith("/late "))
-    assert late.split()[1:] == ["running", "7", "inactive", "·", "connected", "1/2", "1/3"]
-    more = [row for row in rows if "more nodes: lifecycle status robot --watch" in row]
+    status = replace(STATUS, nodes=tuple(nodes))
+    rows = status_text(status, width=80, height=24).splitlines()
+    assert len(rows) == min(count + 2, 24)
+    assert max(map(len, rows)) <= 80
+    late = next(row for row in rows if row.startswith("/late "))
+    assert late.split()[1:] == ["running", "7", "inactive", "1/2", "1/3"]
+    more = [row for row in rows if "more nodes: lifecycle status robot" in row]
     assert bool(more) == (count > 24)
 
 
