@@ -1,7 +1,7 @@
 """Records a delay on a congested link without and with a rule for it, and draws what was recorded.
 
 The system, the link and the rule are those of `benchmarks/congested_link.py`; the file is written
-by `lifecycle flows --watch --format csv`.
+by `lifecycle flows --record`.
 
     python benchmarks/congested_plot.py FILE.csv FILE.svg [--draw-only]
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
-import datetime as dt
 import math
 import sys
 import tempfile
@@ -63,21 +62,17 @@ def record(file: Path) -> float:
         router.ip("link", "set", "right", "txqueuelen", str(frames))
         manifest = write_manifest(CASE, left.ipv4, right.ipv4, directory)
         with brought_up(manifest, left, right, directory):
-            with file.open("wb") as stream:
-                recording = right.popen(
-                    *(*PYTHON, "flows", "congested", "--watch", "--format", "csv"),
-                    env=right.environment(directory / "b"),
-                    stdout=stream,
-                )
+            options = ("--record", str(file), "--force", "--for", f"{2 * EACH_S:g}")
+            recording = right.popen(
+                *PYTHON, "flows", "congested", *options, env=right.environment(directory / "b")
+            )
             began_s = time.monotonic()
             with rule(dataclasses.replace(CASE, apply=None), router, manifest, directory):
                 (directory / "go").touch()
                 time.sleep(EACH_S)
             applied_s = time.monotonic() - began_s
             with rule(CASE, router, manifest, directory):
-                time.sleep(EACH_S)
-            recording.terminate()
-            recording.wait(UP_S)
+                recording.wait(UP_S + EACH_S)
         return applied_s
 
 
@@ -85,9 +80,7 @@ def draw(file: Path, picture: Path) -> None:
     """Draw P1's delays over time, on a logarithmic scale."""
     with file.open(encoding="utf-8", newline="") as lines:
         rows = [each for each in csv.DictReader(lines) if each["topic"] == "/p1"]
-    times = [dt.datetime.fromisoformat(each["time"]) for each in rows]
-    seconds = [(each - times[0]).total_seconds() for each in times]
-    last_s = seconds[-1]
+    last_s = max(float(each["seconds"]) for each in rows)
 
     def x(at_s: float) -> float:
         return LEFT + at_s / last_s * (WIDTH - LEFT - RIGHT)
@@ -111,11 +104,7 @@ def draw(file: Path, picture: Path) -> None:
         f'<text x="{WIDTH - RIGHT + 6}" y="{y(BOUND_MS) + 4:.1f}">≤ {BOUND_MS:g} ms</text>'
     )
     for column, label, colour in LINES:
-        known = [
-            (at_s, float(row[column]))
-            for at_s, row in zip(seconds, rows, strict=True)
-            if row[column]
-        ]
+        known = [(float(row["seconds"]), float(row[column])) for row in rows if row[column]]
         shapes.append(line(((x(at_s), y(ms)) for at_s, ms in known), colour))
         at_y = y(known[-1][1]) + 4
         shapes.append(

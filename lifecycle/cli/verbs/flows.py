@@ -1,15 +1,17 @@
 """`lifecycle flows`: show every network flow, how unique it is and what was measured of it.
 
-Owns: flows as a table, JSON or CSV, `--export`, and the subcommands `apply` and
+Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply` and
 `remove`. Exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations
 
-import datetime as dt
+import contextlib
+import itertools
 import os
 import shlex
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +35,7 @@ from lifecycle.cli.common import (
     timeout_option,
     wrapped,
 )
-from lifecycle.cli.measured import cells
+from lifecycle.cli.measured import Record, cells
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
@@ -42,7 +44,7 @@ from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import FlowMeasurement, measured_summary
 from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.printable import columns, json_text, lines, one_line, shown_length
+from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
 from lifecycle.programming.flows_csv import flows_to_csv
 from lifecycle.programming.names import TARGETS
 from lifecycle.verify.outcome import Outcome
@@ -83,13 +85,12 @@ def render_flows(
     measured: Sequence[FlowMeasurement] = (),
     *,
     colour: bool = False,
-    at: str = "",
 ) -> str:
     """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
 
     In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
     its `tuples`. `transport` is what carries it, not what could. In JSON `measured` is null where
-    nothing was. `at` is the time, for a last column of CSV.
+    nothing was.
     """
     found = {each.pair: each for each in measured}
     flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
@@ -97,7 +98,7 @@ def render_flows(
         documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
         return json_text(to_json(documents).decode())
     if format_ == "csv":
-        return lines(flows_to_csv(flows, found, at=at).rstrip("\n"))
+        return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
     if not flows:
         return "no flow"
     rows = (row for each in flows for row in _rows(each, found.get(each.pair), colour=colour))
@@ -105,14 +106,10 @@ def render_flows(
 
 
 def watched_flows(verdict: Verdict, format_: str) -> str:
-    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first.
-
-    CSV has the time in its last column.
-    """
+    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first."""
     width = terminal_width()
     if format_ != "text" or not width:
-        at = dt.datetime.now(dt.timezone.utc).isoformat(timespec="milliseconds")
-        return render_flows(verdict.flows, format_, verdict.measured, at=at)
+        return render_flows(verdict.flows, format_, verdict.measured)
     from lifecycle.cli.up_output import verdict_line
 
     found, names = {each.pair: each for each in verdict.measured}, _short_names(verdict.flows)
@@ -242,6 +239,20 @@ def command() -> None:
 @assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
+@click.option(
+    "--record",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
+)
+@click.option(
+    "--for",
+    "for_s",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End --record after so long.",
+)
+@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @export_option
 def _show(
@@ -250,12 +261,19 @@ def _show(
     assignments: tuple[str, ...],
     format_: str,
     watch: bool,
+    record: Path | None,
+    for_s: float | None,
+    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
     from lifecycle.supervisor.run import looking
 
+    if record is None and (force or for_s is not None):
+        raise UsageError("cannot use --for or --force without --record FILE")
+    if record is not None and (watch or export_ is not None):
+        raise UsageError("cannot use --record with --watch or --export; run each by itself")
     exported = None
     if export_ is not None:
         if watch:
@@ -269,6 +287,8 @@ def _show(
             hint="give --export, or use lifecycle flows apply",
         )
     plan = _plan_of(target, assignments)
+    if record is not None:
+        return _record(plan, Record(record, replaces=force), for_s)
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
@@ -298,34 +318,68 @@ def _measuring(plan: Plan) -> Path | None:
     return next((each for each in found if each is not None), None)
 
 
-_EACH_S = 1.0
-"""What is measured changes so often."""
-
-
 def _watch(plan: Plan, format_: str) -> int:
     from lifecycle.supervisor.control.server import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
-    is_first = True
     with Watched(whole=format_ == "text") as shown:
-
-        def show(verdict: Verdict) -> None:
-            nonlocal is_first
-            text = watched_flows(verdict, format_)
-            # One table whose head is its first line.
-            shown.show(text.partition("\n")[2] if format_ == "csv" and not is_first else text)
-            is_first = False
-
         if path is None:
-            follow_running(plan, lambda seen: show(seen.verdict), each_s=_EACH_S)
+            follow_running(
+                plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
+            )
             return ExitCode.OK
         with asking(path):
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
-                    show(seen.verdict)
+                    shown.show(watched_flows(seen.verdict, format_))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
+
+
+_EACH_S = 1.0
+"""What is measured changes so often."""
+
+
+def _record(plan: Plan, record: Record, for_s: float | None) -> int:
+    """Write what is measured each second, until it is over or the supervisor ends."""
+    from lifecycle.supervisor.run.looking import follow_running
+
+    path = _measuring(plan)
+    with contextlib.closing(record):
+        try:
+            if path is not None:
+                _record_supervised(path, record, for_s)
+            else:
+                follow_running(
+                    plan,
+                    lambda seen: record.add(seen.verdict.measured),
+                    each_s=_EACH_S,
+                    for_s=for_s,
+                )
+        finally:
+            click.echo(f"{count(record.rows, 'row')} in {str(record.path)!r}", err=True)
+    return ExitCode.OK
+
+
+def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
+    from lifecycle.supervisor.control.client import status
+
+    began_s = time.monotonic()
+    for number in itertools.count():
+        if for_s is not None and number * _EACH_S >= for_s:
+            return
+        time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
+        try:
+            measured = status(path).measured
+        except TimeoutError:
+            continue  # it is busy; the next one may be answered
+        except UsageError:
+            if number == 0:
+                raise
+            click.echo(f"{path.name}: its supervisor has ended", err=True)
+            return
+        record.add(measured)
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import datetime as dt
 import json
 import re
 import signal
@@ -106,50 +105,51 @@ def test_numbers_are_seen_fresh_by_every_way_and_fill_no_journal(
         run.finish()
 
 
-def _recorded(file: Path, runtime: Path, count: int) -> subprocess.Popen[str]:
-    """Watch flows as CSV until a file has so many lines."""
-    with file.open("wb") as stream:
-        recording = subprocess.Popen(
-            [*command("flows"), "pair", "--watch", "--format", "csv"],
-            cwd=ROOT,
-            env=environment(runtime, ""),
-            stdout=stream,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-    while file.read_text().count("\n") < count:
-        assert recording.poll() is None
-        time.sleep(0.1)
-    return recording
-
-
-def test_a_table_that_is_watched_has_a_row_a_second_and_ends_with_its_supervisor(
+def test_a_record_has_a_row_a_second_and_ends_with_its_supervisor(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     file = tmp_path / "flows.csv"
     with up(pair(tmp_path, fresh_domain, edit=DECLARED), runtime=tmp_path) as run:
         decided(run)
-        with _recorded(file, tmp_path, 4) as recording:
-            rows = list(csv.DictReader(file.read_text().splitlines()))
+        words = ("flows", "pair", "--record", str(file))
+        done = verb(*words, "--for", "3", runtime=tmp_path)
+        assert (done.returncode, done.stderr) == (ExitCode.OK, f"3 rows in {str(file)!r}\n")
+        refused = verb(*words, "--for", "3", runtime=tmp_path)
+        assert refused.returncode == ExitCode.USAGE
+        assert "it is there already" in refused.stderr
+        rows = list(csv.DictReader(file.read_text().splitlines()))
+        assert {each["outcome"] for each in rows} == {"violated"}
+        assert [round(float(each["seconds"])) for each in rows] == [0, 1, 2]
+        assert float(rows[-1]["rate_hz"]) == pytest.approx(50, rel=0.2)
+
+        with subprocess.Popen(
+            [*command(words[0]), *words[1:], "--force"],
+            cwd=ROOT,
+            env=environment(tmp_path, ""),
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as recording:
+            while file.read_text().count("\n") < 2 or file.read_text().count("\n") > 3:
+                time.sleep(0.1)
             assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
             assert recording.wait(20) == ExitCode.OK
             assert recording.stderr is not None
             assert "its supervisor has ended" in recording.stderr.read()
-        assert {each["outcome"] for each in rows} == {"violated"}
-        times = [dt.datetime.fromisoformat(each["time"]) for each in rows]
-        assert (times[2] - times[0]).total_seconds() == pytest.approx(2, abs=1)
-        assert float(rows[-1]["rate_hz"]) == pytest.approx(50, rel=0.2)
         run.finish()
 
 
-def test_what_nobody_declares_is_counted_from_outside(tmp_path: Path, fresh_domain: int) -> None:
+def test_what_nobody_declares_is_counted_and_recorded_from_outside(
+    tmp_path: Path, fresh_domain: int
+) -> None:
     file = tmp_path / "flows.csv"
     with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
         run.until("system", reached="active")
         assert "measured" not in verb("status", "pair", runtime=tmp_path).stdout
-        with _recorded(file, tmp_path, 4) as recording:
-            recording.terminate()
+        done = verb("flows", "pair", "--record", str(file), "--for", "3", runtime=tmp_path)
+        assert done.returncode == ExitCode.OK, done.stderr
         rows = list(csv.DictReader(file.read_text().splitlines()))
+        assert len(rows) >= 2
+        assert {each["outcome"] for each in rows} == {""}
         assert int(rows[-1]["messages"]) > 10
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.OK

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import re
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.cli.measured import bar, cells
+from lifecycle.cli.measured import COLUMNS, Record, bar, cells
 from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.cli.verbs.flows import watched_flows
+from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.bounds import Kind
 from lifecycle.measure.flows import FlowMeasurement, MeasuredBound, measured_summary
@@ -164,3 +167,37 @@ def test_a_summary_counts_the_flows_with_declared_numbers_and_names_the_worst_fi
     )
     assert [each.split(": ")[0][-2:] for each in named] == ["/b", "/a"]
     assert measured_summary([*flows, *flows]).endswith("; and 3 more")
+
+
+def test_a_record_has_a_row_for_each_flow_that_is_on_disk_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "flows.csv"
+    record = Record(path, replaces=False)
+    assert path.read_text() == ",".join(COLUMNS) + "\n"
+    unknown = replace(measured(), lost=None, p50_ms=None, p99_ms=None)
+    record.add([measured(LATE, LOSES), unknown])
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    assert record.rows == len(rows) == 2
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", rows[0]["time"])
+    assert 0 <= float(rows[0]["seconds"]) < 10
+    assert [*rows[0].values()][2:] == [
+        *("/robot/video", "/robot/camera", "/operator/station"),
+        *("74", "1", "14.800", "0.420", "58.240", "violated"),
+    ]
+    assert [*rows[1].values()][5:] == ["74", "", "14.800", "", "", ""]
+    record.close()
+
+
+def test_a_record_replaces_a_file_only_if_asked_and_says_why_it_cannot_be_written(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "flows.csv"
+    path.write_text("kept")
+    with pytest.raises(UsageError, match=r"it is there already; name another file, or .* --force"):
+        Record(path, replaces=False)
+    assert path.read_text() == "kept"
+    Record(path, replaces=True).close()
+    assert path.read_text() == ",".join(COLUMNS) + "\n"
+    with pytest.raises(UsageError, match=r"cannot write .*/none/flows.csv': No such file"):
+        Record(tmp_path / "none" / "flows.csv", replaces=False)
+    with pytest.raises(UsageError, match="cannot write '/dev/full': No space left on device"):
+        Record(Path("/dev/full"), replaces=True)
