@@ -36,7 +36,7 @@ class GoalInterruptedError(LifecycleError):
 
 
 class Goals:
-    """The goals of one action server. Closing it ends them all; that is what makes it `Gated`.
+    """The goals of one action server.
 
     Args:
         node: whose it is.
@@ -67,9 +67,6 @@ class Goals:
         self._changed = changed
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None
-
-    def open(self) -> None:
-        """Goals arrive by themselves."""
 
     def close(self) -> None:
         """End what is left: the node is no longer active."""

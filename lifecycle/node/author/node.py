@@ -27,7 +27,7 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
@@ -170,10 +170,10 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             mode = construction.mode or mode
         supervisor = construction.supervisor if construction is not None else ""
         super().__init__(name, namespace=namespace, context=context, **options)
-        self._gate = NodeGate()
         spec = planned or plan_without_manifest(
             type(self), name=self.get_name(), namespace=self.get_namespace()
         )
+        self._gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         if spec.log_level:
             self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         self.lifecycle = Managed(
@@ -577,7 +577,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
             self._found(EndpointKind.SUBSCRIPTION, subscription)
-            gated = GatedSubscription(subscription, self.lifecycle.turns.call_soon)
+            later, counts = self.lifecycle.turns.call_soon, self._gate.counts
+            gated = GatedSubscription(subscription, later, counts=counts)
             self._gate.add(subscription, gated)
         return subscription
 

@@ -141,7 +141,8 @@ class Maker:
             event_callbacks=options.event_callbacks,
             raw=options.raw,
         )
-        self._gate.add(entity, GatedSubscription(entity, self._turns.call_soon))
+        gated = GatedSubscription(entity, self._turns.call_soon, counts=self._gate.counts)
+        self._gate.add(entity, gated)
         return entity
 
     def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
@@ -193,7 +194,7 @@ class Maker:
             group=self._group(endpoint),
         )
         self._goals[id(server)] = goals
-        self._gate.add_worker(server, goals)
+        self._gate.add_worker(server, goals.close)
         return server
 
     def _action_client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:

@@ -29,7 +29,7 @@ from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -175,7 +175,7 @@ class ForeignNode:
         self._loop = loop
         self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
-        self.gate = NodeGate()
+        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
@@ -238,7 +238,7 @@ class ForeignNode:
         if kind is EndpointKind.PUBLISHER:
             self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self.gate.add(entity, CountedSubscription(entity))
+            self.gate.add(entity, CountedSubscription(entity, counts=self.gate.counts))
         watch: Watch | None = None
         if kind.is_topic:
             # In the host's executor: the node's own need not run.

@@ -27,7 +27,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Executor
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -200,8 +199,6 @@ class Host:
         for hosted in self._adoption.make(planned, group, maker):
             self._nodes[hosted.full_name] = hosted
             hosted.gate.measure(self._spec.apart)
-            if planned.run.executor is Executor.EVENTS:
-                hosted.gate.count_nothing()
             if hosted.spec.managed:
                 hosted.add_listener(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
