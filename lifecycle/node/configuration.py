@@ -41,6 +41,7 @@ from lifecycle.middleware.process.hosted import vouch_for
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
@@ -50,9 +51,10 @@ from lifecycle.node.endpoints.endpoint import (
     Endpoint,
     Placement,
     count_peers,
-    found_endpoint,
+    interface_name,
+    wire_name,
 )
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.plan.negotiation.parties import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -263,7 +265,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         connection=connection.name,
         mapped=True,
     )
-    if endpoint.kind in CLIENTS and placement.watch is not None:
+    if endpoint.kind in CLIENTS and placement.unwatch is not None:
         return replace(report, server_matched=is_server_matched(entity))
     if not endpoint.kind.is_topic:
         return report
@@ -374,41 +376,38 @@ class Found:
     Args:
         at: where the node is declared.
         changed: called when one is made or destroyed.
+
+    Attributes:
+        endpoints: those that exist, by id of their rclpy object.
     """
 
     def __init__(self, at: Position, changed: Callable[[], None]) -> None:
         self._at = at
         self._changed = changed
-        self._made: dict[int, tuple[EndpointKind, Placement]] = {}
+        self.endpoints: dict[int, Endpoint] = {}
 
-    def add(self, kind: EndpointKind, placement: Placement) -> None:
+    def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
         """Note one that a factory returned."""
-        self._made[id(placement.entity)] = (kind, placement)
+        entity = placement.entity
+        planned = PlannedEndpoint(
+            kind=kind,
+            name="",
+            resolved=wire_name(entity),
+            type=interface_name(interface_of(entity)),
+            qos=None,
+            at=self._at,
+        )
+        endpoint = self.endpoints[id(entity)] = Endpoint(planned=planned, placement=placement)
         self._changed()
+        return endpoint
 
     def remove(self, entity: Any) -> Placement | None:
         """Forget one that is being destroyed, and return where it was; None if it is not known."""
-        _, placement = self._made.pop(id(entity), (None, None))
-        if placement is not None:
-            self._changed()
-        return placement
-
-    @property
-    def endpoints(self) -> tuple[Endpoint, ...]:
-        """Those that exist."""
-        found = []
-        for key, (kind, placement) in tuple(self._made.items()):
-            try:
-                found.append(found_endpoint(kind, placement, self._at))
-            except InvalidHandle:  # noqa: PERF203
-                self._made.pop(key, None)  # destroyed behind its node's back
-        return tuple(found)
-
-    def close(self) -> None:
-        """Watch none of them any more: their node is being destroyed."""
-        for _, placement in self._made.values():
-            if placement.watch is not None:
-                placement.watch.stop()
+        endpoint = self.endpoints.pop(id(entity), None)
+        if endpoint is None:
+            return None
+        self._changed()
+        return endpoint.placement
 
 
 Listener = Callable[["NodeConfiguration"], None]

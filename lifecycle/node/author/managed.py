@@ -213,7 +213,7 @@ class Managed:
             self.node,
             self.spec,
             self.reported,
-            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints),
+            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
             connections=self.data_layer.connections,
             health=self._health.report,
             measured=self.gate.measured(),

@@ -34,11 +34,10 @@ from lifecycle.node.endpoints.endpoint import (
     Endpoint,
     EndpointOptions,
     Key,
-    MatchWatch,
     Placement,
     UnknownEndpointError,
-    Watch,
     find_endpoint,
+    watch_matches,
 )
 from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
 from lifecycle.node.endpoints.making import Maker
@@ -577,18 +576,18 @@ class DataLayer:
         """Make an endpoint on a connection; where it is now is left alone."""
         self._refuse_shared_flow(endpoint, connection)
         entity = self._maker.make(endpoint, connection)
-        watch: Watch | None = None
+        unwatch: Callable[[], None] | None = None
         if endpoint.kind.is_topic:
-            watch = MatchWatch(
+            unwatch = watch_matches(
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            watch = ServerWatch(connection.node or self._node, entity, self._changed)
-        return Placement(connection=connection, entity=entity, watch=watch)
+            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
+        return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
-        if placement.watch is not None:
-            placement.watch.stop()
+        if placement.unwatch is not None:
+            placement.unwatch()
         self._maker.unmake(endpoint, placement.entity, placement.connection)
         self.events.unmapped(endpoint, placement.connection)
 

@@ -9,7 +9,7 @@ something must not delay the event of a peer that appeared or left.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rclpy.event_handler import (
@@ -21,9 +21,7 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError, nearest
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -103,47 +101,42 @@ def count_peers(entity: Publisher | Subscription) -> int:
     return int(entity.get_publisher_count())
 
 
-class MatchWatch:
-    """Calls back each time that peers of an endpoint were matched or unmatched.
+def watch_matches(
+    node: Node,
+    entity: Publisher | Subscription,
+    group: CallbackGroup,
+    changed: Callable[[], None],
+) -> Callable[[], None]:
+    """Call `changed` each time that peers of an endpoint were matched or unmatched.
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
         entity: what to watch.
         group: reentrant.
         changed: is called.
+
+    Returns:
+        What ends it, before the endpoint is destroyed.
     """
-
-    def __init__(
-        self,
-        node: Node,
-        entity: Publisher | Subscription,
-        group: CallbackGroup,
-        changed: Callable[[], None],
-    ) -> None:
-        self._node = node
-        self._handler: EventHandler | None = None
-        event = (
-            QoSPublisherEventType.RCL_PUBLISHER_MATCHED
-            if isinstance(entity, Publisher)
-            else QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
+    event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
+    if isinstance(entity, Publisher):
+        event = QoSPublisherEventType.RCL_PUBLISHER_MATCHED
+    try:
+        handler = EventHandler(
+            callback_group=group,
+            callback=lambda _: changed(),
+            event_type=event,
+            parent_impl=entity.handle,
         )
-        try:
-            self._handler = EventHandler(
-                callback_group=group,
-                callback=lambda _: changed(),
-                event_type=event,
-                parent_impl=entity.handle,
-            )
-        except UnsupportedEventTypeError:
-            return  # an RMW without the event: counts are then read on request
-        node.add_waitable(self._handler)
+    except UnsupportedEventTypeError:
+        return lambda: None  # an RMW without the event: counts are then read on request
+    node.add_waitable(handler)
 
-    def stop(self) -> None:
-        """End it, before the endpoint is destroyed; again is harmless."""
-        if self._handler is not None:
-            self._node.remove_waitable(self._handler)
-            self._handler.destroy()
-            self._handler = None
+    def stop() -> None:
+        node.remove_waitable(handler)
+        handler.destroy()
+
+    return stop
 
 
 class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -176,23 +169,16 @@ _FITTING = {
 }
 
 
-class Watch(Protocol):
-    """What notifies of the peers or the server of an endpoint."""
-
-    def stop(self) -> None:
-        """End it, before the endpoint is destroyed; again is harmless."""
-
-
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The rclpy object of an endpoint on one connection.
 
     Attributes:
-        watch: notifies of its peers or its server; None where nothing is watched.
+        unwatch: ends that its peers or its server are watched; None where they are not.
     """
 
     connection: Connection
     entity: Any
-    watch: Watch | None = None
+    unwatch: Callable[[], None] | None = None
 
 
 class Endpoint(msgspec.Struct, kw_only=True, eq=False):
@@ -265,20 +251,6 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     def connection(self) -> Connection | None:
         """Where it is mapped; None while it is nowhere."""
         return None if self.placement is None else self.placement.connection
-
-
-def found_endpoint(kind: EndpointKind, placement: Placement, at: Position) -> Endpoint:
-    """Return an endpoint that only the code that made it knows of.
-
-    Args:
-        kind: what it is.
-        placement: its rclpy object.
-        at: where its node is declared.
-    """
-    type_ = interface_name(interface_of(placement.entity))
-    resolved = wire_name(placement.entity)
-    planned = PlannedEndpoint(kind=kind, name="", resolved=resolved, type=type_, qos=None, at=at)
-    return Endpoint(planned=planned, placement=placement)
 
 
 def interface_name(interface: type[Any]) -> str:

@@ -16,11 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import (
-    EventHandler,
-    QoSPublisherEventType,
-    QoSSubscriptionEventType,
-)
+from rclpy.event_handler import QoSPublisherEventType, QoSSubscriptionEventType
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -35,7 +31,6 @@ from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
-    Watching,
     follow_goals,
     is_rclpy_managed,
 )
@@ -44,7 +39,7 @@ from lifecycle.node import configuration
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.node_interface import serve_interface
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
+from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, Placement, watch_matches
 from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
@@ -52,8 +47,6 @@ from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-
     from lifecycle.node.endpoints.data_layer import DataLayer
     from lifecycle.node.host.loop import NodeLoop
 
@@ -67,50 +60,6 @@ _MATCHED = {
 _REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
-
-
-class SharedMatch:
-    """A matched event that a node's own code handles, and its host needs.
-
-    rmw counts the changes for one handler: two in different executors take them from each other.
-
-    Args:
-        node: whose it is.
-        event: its own handler.
-        group: that the host's executor runs it in.
-        watching: has it from now on.
-        changed: called for each event.
-        forward: has the node's callback called with the status.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        event: EventHandler,
-        group: CallbackGroup,
-        watching: Watching,
-        *,
-        changed: Callable[[], None],
-        forward: Callable[[Callable[[Any], Any], Any], None],
-    ) -> None:
-        self.node = node
-        self._event = event
-        self._watching = watching
-        callback = event.callback
-
-        def handle(status: Any) -> None:
-            changed()
-            forward(callback, status)
-
-        node.remove_waitable(event)
-        event.callback = handle
-        event.callback_group = group
-        watching.add_waitable(event)
-
-    def stop(self) -> None:
-        """Wait for it no more: its endpoint is about to be destroyed, by its node."""
-        self._watching.remove_waitable(self._event)
-        self.node.add_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):
@@ -179,7 +128,6 @@ class ForeignNode:
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
-        self._faults: dict[int, str] = {}  # by id of the action server
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
@@ -239,38 +187,46 @@ class ForeignNode:
             self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         elif kind is EndpointKind.SUBSCRIPTION:
             self.gate.add(entity, CountedSubscription(entity, counts=self.gate.counts))
-        watch: Watch | None = None
+        unwatch: Callable[[], None] | None = None
         if kind.is_topic:
-            # In the host's executor: the node's own need not run.
-            watch = self._match_watch(kind, entity)
+            unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
-            watch = ServerWatch(self.node, entity, self.configuration_changes.touch)
-        elif kind is EndpointKind.ACTION_SERVER:
-            follow_goals(entity, functools.partial(self._goal_ended, id(entity)))
+            unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
         connection = self._apart.pop(id(entity), self._connections.own)
-        self._found.add(kind, Placement(connection=connection, entity=entity, watch=watch))
+        placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
+        endpoint = self._found.add(kind, placement)
+        if kind is EndpointKind.ACTION_SERVER:
+            follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
-    def _goal_ended(self, server: int, error: Exception | None) -> None:
+    def _goal_ended(self, endpoint: Endpoint, error: Exception | None) -> None:
         """Keep what the handler of an action raised at its last goal."""
         fault = "" if error is None else f"its handler raised {error_text(error)}"
-        if fault != self._faults.get(server, ""):
-            self._faults[server] = fault
+        if fault != endpoint.fault:
+            endpoint.fault = fault
             self.configuration_changes.touch()
 
-    def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
+    def _watch_matches(self, kind: EndpointKind, entity: Any) -> Callable[[], None]:
+        """Watch in the host's executor, for the node's own need not run; returns what ends that."""
+        watching: Any = self._watching
         touch = self.configuration_changes.touch
-        for event in entity.event_handlers:
-            if event.event_type == _MATCHED[kind]:
-                return SharedMatch(
-                    self.node,
-                    event,
-                    self._group,
-                    self._watching,
-                    changed=touch,
-                    forward=self._forward,
-                )
-        sink: Any = self._watching
-        return MatchWatch(sink, entity, self._group, touch)
+        event = next((e for e in entity.event_handlers if e.event_type == _MATCHED[kind]), None)
+        if event is None:
+            return watch_matches(watching, entity, self._group, touch)
+        # rmw counts the changes for one handler: two would take them from each other.
+        callback = event.callback
+
+        def handle(status: Any) -> None:
+            touch()
+            self._forward(callback, status)
+
+        def stop() -> None:
+            watching.remove_waitable(event)
+            self.node.add_waitable(event)
+
+        self.node.remove_waitable(event)
+        event.callback, event.callback_group = handle, self._group
+        watching.add_waitable(event)
+        return stop
 
     def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
         """Have a callback of its own called; while it is not spun, the last time once it is."""
@@ -347,8 +303,8 @@ class ForeignNode:
         placement = self._found.remove(entity)
         if placement is None:
             return
-        if placement.watch is not None:
-            placement.watch.stop()
+        if placement.unwatch is not None:
+            placement.unwatch()
         if isinstance(entity, Publisher) and placement.connection.participant is not None:
             placement.connection.participant.destroy_endpoint(entity)
 
@@ -368,8 +324,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in self._found.endpoints:
-            each.fault = self._faults.get(id(each.entity), "")
+        for each in self._found.endpoints.values():
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -409,7 +364,9 @@ class ForeignNode:
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        self._found.close()
+        for each in self._found.endpoints.values():
+            if each.placement is not None and each.placement.unwatch is not None:
+                each.placement.unwatch()
         self._watching.drop_services(self._services)
         self._connections.close_all()
 
