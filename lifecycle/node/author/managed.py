@@ -25,6 +25,7 @@ from lifecycle.node.author.spec import Mode
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.node_interface import acts_of, serve_interface
 from lifecycle.node.endpoints.data_layer import DataLayer
+from lifecycle.node.lifecycle import services
 from lifecycle.node.lifecycle.gate import NodeGate
 from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import (
@@ -32,9 +33,10 @@ from lifecycle.node.lifecycle.machine import (
     NodeState,
     RefusedError,
     StateChange,
+    Transition,
     TransitionRequest,
 )
-from lifecycle.node.lifecycle.services import LifecycleServices, Turns
+from lifecycle.node.lifecycle.services import Turns
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
@@ -85,18 +87,15 @@ class Managed:
         self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
-        self._services: LifecycleServices | None = None
+        self._publish: Callable[[Transition], None] = lambda _: None
         self.configuration_changes = ConfigurationChanges(
             self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
         )
         changed = self.configuration_changes.touch
-        self._health = HealthCheck(
-            health,
-            self.turns,
-            spec.health or Health(),
-            changed=changed,
-            failed=node.get_logger().error,
-        )
+        self._health: HealthCheck | None = None
+        if health is not None:
+            how, failed = spec.health or Health(), node.get_logger().error
+            self._health = HealthCheck(health, self.turns, how, changed=changed, failed=failed)
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found = Found(spec.at, changed)
         self.data_layer = DataLayer(
@@ -104,7 +103,7 @@ class Managed:
         )
         self._machine = Machine(self, spec.timeouts)
         if served:
-            self._services = LifecycleServices(node, self._machine, self.turns.group)
+            self._publish = services.serve(node, self._machine, self.turns.group)
             configuration.serve(node, self.get_configuration, self.turns.group)
             serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
@@ -178,10 +177,10 @@ class Managed:
         """Bring the node up on the first turn of whatever executor spins it."""
 
         async def once() -> None:
-            self.turns.end(timer)
+            end()
             await self.bring_up()
 
-        timer = self.turns.timer(0.0, once)
+        end = self.turns.call_every(0.0, once)
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds`, in every state."""
@@ -215,7 +214,7 @@ class Managed:
             self.reported,
             endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
             connections=self.data_layer.connections,
-            health=self._health.report,
+            health=None if self._health is None else self._health.report,
             measured=self.gate.measured(),
         )
 
@@ -262,11 +261,12 @@ class Managed:
         """Notify others of a change of the state."""
         if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
             self._let_through = False
-        if change.event is not None and self._services is not None:
-            self._services.publish(change.event)
+        if change.event is not None:
+            self._publish(change.event)
         if self._reporter is not None:
             self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
-        self._health.follow(change.goal)
+        if self._health is not None:
+            self._health.follow(change.goal)
         for listener in self._listeners:
             listener(self)
 

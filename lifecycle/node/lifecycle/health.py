@@ -1,9 +1,8 @@
 """Health of a node: its author's `health` method, asked at an interval, and what it last returned.
 
-Owns: `HealthCheck`: when the method is asked (from when the node is connected, at once after each
-change of state, then every `interval_s`), its deadline, and how an answer becomes a `HealthReport`,
-which is part of the node's configuration. What must be healthy, and what follows if it is not, is
-the manifest's matter (lifecycle.verify).
+It is asked from when the node is connected, at once after each change of state, then every
+`interval_s`. What must be healthy, and what follows if it is not, is the manifest's matter
+(lifecycle.verify).
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.verify.observation import HealthReport
 
 if TYPE_CHECKING:
-    from rclpy.timer import Timer
-
     from lifecycle.node.lifecycle.services import Turns
 
 _LONGEST = 200
@@ -31,20 +28,19 @@ class HealthCheck:
     """Asks one node how it is.
 
     Args:
-        check: returns None, True or "" if all is well, else what is wrong; may be async. None for a
-            node without one.
+        check: returns None, True or "" if all is well, else what is wrong; may be async.
         turns: has it asked in the node's executor.
         how: interval and deadline.
         changed: called whenever `report` is another one, or the first in another state.
         failed: logs a traceback.
 
     Attributes:
-        report: the last answer; None while the node is not connected, or has no check.
+        report: the last answer; None while the node is not connected.
     """
 
     def __init__(
         self,
-        check: Callable[[], Any] | None,
+        check: Callable[[], Any],
         turns: Turns,
         how: Health,
         *,
@@ -56,7 +52,7 @@ class HealthCheck:
         self._how = how
         self._changed = changed
         self._failed = failed
-        self._timer: Timer | None = None
+        self._end: Callable[[], None] | None = None
         self._asked_s: float | None = None
         self._round = 0
         self._is_stale = False
@@ -64,27 +60,26 @@ class HealthCheck:
 
     def follow(self, state: NodeState) -> None:
         """Begin to ask, ask again or stop, as the node's new state says."""
-        if self._check is None or not state.steady:
+        if not state.steady:
             return
         if not state.connected:
             self._stop()
             return
-        if self._timer is None:
-            self._timer = self._turns.timer(self._how.interval_s, self._ask)
+        if self._end is None:
+            self._end = self._turns.call_every(self._how.interval_s, self._ask)
         self._asked_s = None  # what it says of the state before counts no more
         self._is_stale = True
         self._round += 1
         self._ask()
 
     def _stop(self) -> None:
-        if self._timer is not None:
-            self._turns.end(self._timer)
-            self._timer = None
+        if self._end is not None:
+            self._end()
+            self._end = None
         self._round += 1
         self._asked_s = self.report = None
 
     def _ask(self) -> None:
-        assert self._check is not None
         if self._asked_s is not None:
             waited_s = time.monotonic() - self._asked_s
             if waited_s >= self._how.timeout_s:

@@ -37,13 +37,10 @@ class Bench:
 
     # What it asks of its turns.
 
-    def timer(self, period_s: float, callback: Callable[[], None]) -> Callable[[], None]:
+    def call_every(self, period_s: float, callback: Callable[[], None]) -> Callable[[], None]:
         assert period_s == 2.0
         self.ticks.append(callback)
-        return callback
-
-    def end(self, timer: Callable[[], None]) -> None:
-        self.ticks.remove(timer)
+        return lambda: self.ticks.remove(callback)
 
     def call_soon(self, task: Callable[[], Any]) -> bool:
         self.tasks.append(task)
