@@ -32,7 +32,6 @@ from lifecycle.node.lifecycle.machine import (
     Machine,
     NodeState,
     RefusedError,
-    StateChange,
     Transition,
     TransitionRequest,
 )
@@ -257,16 +256,22 @@ class Managed:
             except Exception:  # noqa: BLE001, PERF203 - a fault of ours
                 self.node.get_logger().error(traceback.format_exc())
 
-    def changed(self, change: StateChange) -> None:
-        """Notify others of a change of the state."""
-        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
+    def changed(self, state: NodeState, event: Transition | None) -> None:
+        """Notify others of a change of the state.
+
+        Args:
+            state: the new one.
+            event: the edge that other tools are to be shown; None for a change that they do not
+                see.
+        """
+        if self._supervisor and state in _WITHOUT_DATA_LAYER:
             self._let_through = False
-        if change.event is not None:
-            self._publish(change.event)
+        if event is not None:
+            self._publish(event)
         if self._reporter is not None:
-            self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
+            self._reporter.report(state=state.seen.label, connected=state.connected)
         if self._health is not None:
-            self._health.follow(change.goal)
+            self._health.follow(state)
         for listener in self._listeners:
             listener(self)
 

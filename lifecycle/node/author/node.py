@@ -31,17 +31,16 @@ from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.author import parameters
 from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
+    Construction,
     Mode,
     calling_position,
     default_name,
     parse_mode,
     plan_without_manifest,
-    take_construction,
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
@@ -140,6 +139,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     lifecycle: Managed
     _gate: NodeGate | None = None
     """None until rclpy has made its own publishers: those are never held back."""
+    _construction: Construction | None = None
+    """Set by the process that hosts it, before rclpy constructs it."""
 
     def __init__(
         self,
@@ -158,34 +159,25 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
                 "allowed: True, False"
             )
         name = node_name or default_name(type(self))
-        construction = take_construction(name, namespace)
-        planned = construction.spec if construction is not None else None
-        if planned is not None:
-            name, namespace = planned.name, planned.namespace
-            options = parameters.planned_options(planned, options)
-            parameters.give_empty_arrays(self, planned)
-        if construction is not None:
-            context = construction.context or context
-            options.setdefault("use_global_arguments", construction.use_global_arguments)
-            mode = construction.mode or mode
-        supervisor = construction.supervisor if construction is not None else ""
         super().__init__(name, namespace=namespace, context=context, **options)
-        spec = planned or plan_without_manifest(
-            type(self), name=self.get_name(), namespace=self.get_namespace()
-        )
+        by_host = self._construction
+        spec = by_host.spec if by_host is not None else None
+        if spec is None:
+            name, namespace = self.get_name(), self.get_namespace()
+            spec = plan_without_manifest(type(self), name=name, namespace=namespace)
         self._gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         if spec.log_level:
             self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         self.lifecycle = Managed(
             self,
             spec,
-            mode,
+            by_host.mode or mode if by_host is not None else mode,
             self._gate,
-            supervisor,
+            by_host.supervisor if by_host is not None else "",
             served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
-        if construction is None and mode is Mode.AUTO:
+        if by_host is None and mode is Mode.AUTO:
             self.lifecycle.bring_up_when_spun()
 
     @property

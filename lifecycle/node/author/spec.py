@@ -1,15 +1,7 @@
-"""The plan of a node before it is constructed: its PlannedNode, remappings and `module:Class`.
-
-Owns: the construction context through which a host hands a class its part of the plan, so that
-`Camera()` works under the supervisor, alone with a manifest, and alone without one; the plan of a
-node that has no manifest, filled by its own `declare_…` calls; and finding a class by
-`module:Class`, or saying why it cannot be found. Imports no rclpy.
-"""
+"""The plan of a node before it is constructed: its PlannedNode, remappings and `module:Class`."""
 
 from __future__ import annotations
 
-import contextlib
-import contextvars
 import enum
 import importlib
 import importlib.util
@@ -17,8 +9,8 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import msgspec
 
@@ -26,11 +18,6 @@ from lifecycle.errors import BringUpError, LifecycleError, nearest
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.plan.model import PlannedNode
-
-if TYPE_CHECKING:
-    from rclpy.context import Context
-
-    from lifecycle.node.host.adoption import Adoption
 
 
 class Mode(enum.Enum):
@@ -41,47 +28,18 @@ class Mode(enum.Enum):
 
 
 class Construction(msgspec.Struct, frozen=True, kw_only=True):
-    """What a host says to the node that it is about to construct.
+    """What a host says of a node that it is about to construct; it drives the node, too.
 
     Attributes:
         spec: the node's part of the plan; None for a node without a manifest.
-        mode: what drives it; None leaves that to the node's own code. A host that says something
-            also does it: the node does not bring itself up.
-        context: the rclpy context to live in; None for the default one.
-        use_global_arguments: take remaps from the process's own --ros-args.
+        mode: what drives it; None leaves that to the node's own code.
         supervisor: name of the system whose supervisor alone may activate the node, once its gate
             is open; empty for a node that runs by itself.
     """
 
     spec: PlannedNode | None
-    mode: Mode | None = None
-    context: Context | None = None
-    use_global_arguments: bool = False
+    mode: Mode | None
     supervisor: str = ""
-
-
-_CURRENT: contextvars.ContextVar[Construction | Adoption | None] = contextvars.ContextVar(
-    "lifecycle_construction", default=None
-)
-
-
-@contextlib.contextmanager
-def constructing(construction: Construction | Adoption) -> Iterator[None]:
-    """Make the next LifecycleNode that is constructed inside the block this one, or these."""
-    token = _CURRENT.set(construction)
-    try:
-        yield
-    finally:
-        _CURRENT.reset(token)
-
-
-def take_construction(name: str, namespace: str | None) -> Construction | None:
-    """Return the pending construction once; a second node made by the first gets None."""
-    construction = _CURRENT.get()
-    if construction is None or not isinstance(construction, Construction):
-        return None if construction is None else construction.take(name, namespace)
-    _CURRENT.set(None)
-    return construction
 
 
 def parse_mode(word: str) -> Mode:
