@@ -23,6 +23,7 @@ from lifecycle.node.author import parameters
 from lifecycle.node.author.handlers import alternatives, match
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
+from lifecycle.node.connections.connection_status import ConnectionEvents
 from lifecycle.node.connections.node_interface import acts_of, serve_interface
 from lifecycle.node.endpoints.data_layer import DataLayer
 from lifecycle.node.lifecycle import services
@@ -60,6 +61,7 @@ class Managed:
         turns: has things done in its executor.
         spec: what the node was planned to be.
         data_layer: its endpoints.
+        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories.
     """
@@ -100,6 +102,7 @@ class Managed:
         self.data_layer = DataLayer(
             node, spec, gate, self.turns, state=lambda: self.state, changed=changed
         )
+        self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
         self._machine = Machine(self, spec.timeouts)
         if served:
             self._publish = services.serve(node, self._machine, self.turns.group)

@@ -539,7 +539,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.data_layer.events.listen(callback)
+        return self.lifecycle.connection_events.listen(callback)
 
     # The factories of rclpy: what they make is gated.
 

@@ -27,7 +27,6 @@ from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.author.handlers import alternatives, needs_handler
-from lifecycle.node.connections.connection_status import ConnectionEvents
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint import (
     CLIENTS,
@@ -36,6 +35,7 @@ from lifecycle.node.endpoints.endpoint import (
     Key,
     Placement,
     UnknownEndpointError,
+    count_peers,
     find_endpoint,
     watch_matches,
 )
@@ -92,7 +92,6 @@ class DataLayer:
     Attributes:
         endpoints: from configure to cleanup every declared endpoint, in the order of declaration.
         connections: what endpoints may be mapped onto.
-        events: what becomes of connections and mappings.
         is_made: connect has made all of it, or found it made by the authority.
     """
 
@@ -118,7 +117,6 @@ class DataLayer:
         self._handovers: dict[Key, tuple[Handover, Placement]] = {}
         self.endpoints: dict[Key, Endpoint] = {}
         self.connections = Connections(node)
-        self.events = ConnectionEvents(turns.call_soon, self.endpoints)
         self.is_made = False
 
     # What is declared.
@@ -346,8 +344,6 @@ class DataLayer:
             self._unmap(endpoint)
             if endpoint.handle is not None:
                 endpoint.handle.forget()
-        for connection in reversed(self.connections.named):
-            self._close(connection)
         self.connections.close_all()
         self.is_made = False
         self._changed()
@@ -363,7 +359,7 @@ class DataLayer:
         try:
             for planned in self._spec.participants:
                 if planned.connection:
-                    self.events.opened(self.connections.carrier(planned))
+                    self.connections.carrier(planned)
             for current in self.endpoints.values():
                 if current.placement is None:
                     self._map(current, self._default(current))
@@ -373,7 +369,7 @@ class DataLayer:
                     self._unmap(each)
             for connection in self.connections.named:
                 if connection not in connected_before:
-                    self._close(connection)
+                    self.connections.close(connection)
             if current is None:
                 raise ConnectError(str(error)) from error
             current.error = str(error)
@@ -402,10 +398,6 @@ class DataLayer:
                 hint=f"call {self._name}/map_to for each, or write data_layer.authority: nodes",
             )
 
-    def _close(self, connection: Connection) -> None:
-        self.connections.close(connection)
-        self.events.closed(connection)
-
     # The node interface.
 
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
@@ -415,11 +407,9 @@ class DataLayer:
         name = name or self.connections.free_name()
         planned = next((each for each in self._spec.participants if each.connection == name), None)
         try:
-            connection = self.connections.connect_to(name, how, planned)
+            return self.connections.connect_to(name, how, planned)
         finally:
             self._changed()
-        self.events.opened(connection)
-        return connection
 
     def map_to(self, spelling: str, connection: Connection | str) -> Future:
         """Map an endpoint, or hand it over from where it is: LifecycleNode.map_to.
@@ -465,7 +455,7 @@ class DataLayer:
                 running[0].end()
             if endpoint.connection is found:
                 self._unmap(endpoint)
-        self._close(found)
+        self.connections.close(found)
         self._changed()
 
     def remap(self, spelling: str, name: str) -> None:
@@ -486,7 +476,6 @@ class DataLayer:
                 endpoint.given_name = before
                 raise
             self._take_over(endpoint, old)
-            self.events.mapped(endpoint)
         self._changed()
 
     def _refuse_unconfigured(self, what: str) -> None:
@@ -509,7 +498,6 @@ class DataLayer:
         endpoint.placement = self._place(endpoint, connection)
         if endpoint.handle is not None:
             endpoint.handle.attach(endpoint.entity)
-        self.events.mapped(endpoint)
         self._changed()
 
     def _unmap(self, endpoint: Endpoint) -> None:
@@ -520,7 +508,7 @@ class DataLayer:
             return
         if endpoint.handle is not None:
             endpoint.handle.detach()
-        endpoint.placement = endpoint.peers = None
+        endpoint.placement = None
         self._unplace(endpoint, placement)
 
     def _move(self, endpoint: Endpoint, connection: Connection) -> Future:
@@ -537,7 +525,7 @@ class DataLayer:
 
     def _hand_over(self, endpoint: Endpoint, old: Placement, connection: Connection) -> Future:
         """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
-        peers = endpoint.peers
+        peers = _peers(endpoint)
         endpoint.placement = self._place(endpoint, connection)
         endpoint.error = ""
 
@@ -548,14 +536,13 @@ class DataLayer:
             self._changed()
 
         # Two servers would both answer; and a client's answers may still be under way.
-        lives_on = bool(peers) if endpoint.kind.is_topic else endpoint.kind in CLIENTS
+        lives_on = peers > 0 if endpoint.kind.is_topic else endpoint.kind in CLIENTS
         handover = Handover(peers_before=peers or 1, after=self._turns.call_after, finish=finish)
         self._handovers[endpoint.key] = (handover, old)
-        self.events.mapped(endpoint)
         if not lives_on or self._node.executor is None:
             handover.end()
         else:
-            handover.peers_changed(endpoint.peers or 0)
+            handover.peers_changed(_peers(endpoint))
         return handover.done
 
     def _end_handover(self, endpoint: Endpoint) -> None:
@@ -589,14 +576,12 @@ class DataLayer:
         if placement.unwatch is not None:
             placement.unwatch()
         self._maker.unmake(endpoint, placement.entity, placement.connection)
-        self.events.unmapped(endpoint, placement.connection)
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""
-        self.events.matched(endpoint)
         running = self._handovers.get(endpoint.key)
         if running is not None:
-            running[0].peers_changed(endpoint.peers or 0)
+            running[0].peers_changed(_peers(endpoint))
         self._changed()  # as many peers as before may be others
 
     def _tidy(self) -> None:
@@ -626,6 +611,11 @@ class DataLayer:
                         f"(strictly_required), and would share it with publisher {two.name!r}",
                         hint="give each a connection of its own",
                     )
+
+
+def _peers(endpoint: Endpoint) -> int:
+    """Return how many peers an endpoint has where it is now; 0 of what has no count."""
+    return count_peers(endpoint.entity) if endpoint.kind.is_topic and endpoint.placement else 0
 
 
 def _refuse_other(planned: PlannedEndpoint, before: PlannedEndpoint) -> None:

@@ -195,7 +195,6 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         error: why it could not be made as asked; empty if it was.
         fault: what its handler raised at the last goal of an action; empty if it returned.
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
-        peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
         options: how it is made, as far as code says it.
@@ -211,7 +210,6 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     error: str = ""
     fault: str = ""
     given_name: str = ""
-    peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None
     options: EndpointOptions = EndpointOptions()

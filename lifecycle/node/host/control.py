@@ -153,7 +153,10 @@ _LAST_S = 1.0
 """For a supervisor to read what is still to be sent when a host ends."""
 
 _NEWEST = frozenset({"state", "configuration", "beat", "measured"})
-"""Events of which only the latest of a node is worth sending to who has not read the one before."""
+"""Events of which only the latest of a node is worth sending to who does not read."""
+
+_MANY = 16
+"""So many events wait for a supervisor that does not read."""
 
 
 class HostChannel:
@@ -217,8 +220,10 @@ class HostChannel:
         line = codec.to_json(event) + b"\n"
         with self._changed:
             self._number += 1
-            key = (event.kind, event.node) if event.kind in _NEWEST else (self._number,)
-            self._kept.pop(key, None)  # the newer one takes a place behind all others
+            key: tuple[object, ...] = (self._number,)
+            if event.kind in _NEWEST and len(self._kept) >= _MANY:
+                key = (event.kind, event.node)
+                self._kept.pop(key, None)  # the newer one takes a place behind all others
             self._kept[key] = line
             self._changed.notify_all()
 
