@@ -1,8 +1,5 @@
 """Action goals of a node: from acceptance through the handler to the result, abort or cancel.
 
-Owns: what a handler's return value or exception makes of its goal; how a goal that can be worked on
-no longer is taken from its handler; and an action's name in the graph.
-
 rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the action, so
 that its name is what is left of theirs. `manifest.names.resolve` is the same without ROS.
 """
@@ -68,15 +65,14 @@ class Goals:
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None
 
-    def close(self) -> None:
-        """End what is left: the node is no longer active."""
-        self.interrupt(f"{self._node} is no longer active")
-
-    def interrupt(self, reason: str) -> None:
+    def end(self) -> None:
         """Take every goal from its handler, and answer those that wait for its result.
 
         A handler that causes this by what it does itself is left alone: it can still return.
         """
+        reason = f"{self._node} is no longer active"
+        if self._is_open():
+            reason = "it was taken off where it was mapped"
         if self.server is None:
             return
         for goal in self.server.goals:

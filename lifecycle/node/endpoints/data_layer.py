@@ -1,10 +1,7 @@
 """The data layer of a node: what it declares, and which connection each of it is mapped onto.
 
-Owns: the endpoints by kind and name, as the node's manifest or plan and its own code declare them,
-taken together; the order in which connections and endpoints are made and removed; `connect_to`,
-`map_to`, `disconnect` and `remap`, in which states they are allowed, and that a strictly unique
-flow is not shared: one implementation behind the local API, the ROS services (node_interface.py)
-and the control channel.
+One implementation behind the local API, the ROS services (node_interface.py) and the control
+channel.
 
 *configure* imports what is declared, *connect* maps what is not mapped yet onto the connection
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
@@ -113,6 +110,7 @@ class DataLayer:
         self._state = state
         self._changed = changed
         self._maker = Maker(node, gate, turns, changed)
+        self._participants = {each.name: each for each in spec.participants}
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
         self._handovers: dict[Key, tuple[Handover, Placement]] = {}
         self.endpoints: dict[Key, Endpoint] = {}
@@ -208,17 +206,13 @@ class DataLayer:
         endpoint.options = options
 
     def find(self, spelling: str) -> Endpoint:
-        """Return the endpoint `video`, `publishers/video`, or `publishers//robot/video` in full.
+        """Return the endpoint `video`, or `publishers/video`.
 
         Raises:
             UnknownEndpointError: none, or more than one, is called so.
         """
-        declared = self.endpoints
-        if self._state() is NodeState.UNCONFIGURED:
-            declared = self._declared
-        on_wire = {each.kind.spell(each.wire_name): each for each in self.endpoints.values()}
-        if spelling in on_wire and spelling not in {e.spelling for e in self.endpoints.values()}:
-            return on_wire[spelling]
+        is_early = self._state() is NodeState.UNCONFIGURED
+        declared = self._declared if is_early else self.endpoints
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
     def publisher(self, name: str) -> DeclaredPublisher:
@@ -379,13 +373,8 @@ class DataLayer:
 
     def _default(self, endpoint: Endpoint) -> Connection:
         """Return the connection that the plan says; make its participant at first use."""
-        name = endpoint.planned.participant
-        if not name:
-            return self.connections.own
-        for each in self._spec.participants:
-            if each.name == name:
-                return self.connections.carrier(each)
-        raise ConnectError(f"cannot find participant {name!r} in the plan of {self._name}")
+        planned = self._participants.get(endpoint.planned.participant)
+        return self.connections.own if planned is None else self.connections.carrier(planned)
 
     def _refuse_unmapped(self) -> None:
         missing = [each.spelling for each in self.endpoints.values() if each.placement is None]
@@ -421,8 +410,9 @@ class DataLayer:
         endpoint = self.find(spelling)
         target = self.connections.find(connection)
         try:
-            if target is self.connections.own and not self._is_on_named(endpoint.planned):
-                target = self._default(endpoint)
+            planned = self._participants.get(endpoint.planned.participant)
+            if target is self.connections.own and planned is not None and not planned.connection:
+                target = self.connections.carrier(planned)
             return self._move(endpoint, target)
         except LifecycleError as error:
             message = (
@@ -485,11 +475,6 @@ class DataLayer:
                 f"cannot {what}: it is {state.value!r}",
                 hint="endpoints are declared from configure until cleanup; configure it first",
             )
-
-    def _is_on_named(self, planned: PlannedEndpoint) -> bool:
-        """Whether the plan has an endpoint on a connection with a name."""
-        named = {each.name for each in self._spec.participants if each.connection}
-        return planned.participant in named
 
     # Single endpoints.
 
@@ -575,7 +560,7 @@ class DataLayer:
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
         if placement.unwatch is not None:
             placement.unwatch()
-        self._maker.unmake(endpoint, placement.entity, placement.connection)
+        self._maker.unmake(endpoint.kind, placement.entity, placement.connection)
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""

@@ -1,8 +1,7 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
-Owns: which factory of rclpy makes which kind, with which QoS, callback group and gate; those of our
-own node are for what its author's code makes. It keeps nothing but the goals of action servers:
-what exists where is data_layer.py's.
+The factories of our own node are for what its author's code makes. What exists where is
+data_layer.py's.
 """
 
 from __future__ import annotations
@@ -32,6 +31,14 @@ if TYPE_CHECKING:
     from lifecycle.node.lifecycle.services import Turns
 
 
+_DESTROY = {
+    EndpointKind.PUBLISHER: "destroy_publisher",
+    EndpointKind.SUBSCRIPTION: "destroy_subscription",
+    EndpointKind.SERVICE_SERVER: "destroy_service",
+    EndpointKind.SERVICE_CLIENT: "destroy_client",
+}
+
+
 class Maker:
     """Makes and destroys the entities of one node.
 
@@ -49,7 +56,6 @@ class Maker:
         self._gate = gate
         self._turns = turns
         self._changed = changed
-        self._goals: dict[int, Goals] = {}  # by id of the action server
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
         """Return a new rclpy entity of an endpoint on a connection.
@@ -70,7 +76,7 @@ class Maker:
             )
         made = wire_name(entity)
         if endpoint.given_name and made and made != endpoint.given_name:
-            self.unmake(endpoint, entity, connection)
+            self.unmake(kind, entity, connection)
             raise LifecycleError(
                 f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
                 f"rule that the node was started with makes it {made!r}",
@@ -78,24 +84,15 @@ class Maker:
             )
         return entity
 
-    def unmake(self, endpoint: Endpoint, entity: Any, connection: Connection) -> None:
+    def unmake(self, kind: EndpointKind, entity: Any, connection: Connection) -> None:
         """Destroy an entity that `make` returned for an endpoint on a connection."""
-        goals = self._goals.pop(id(entity), None)
-        if goals is not None:
-            goals.interrupt("it was taken off where it was mapped")
         self._gate.remove(entity)
         if connection.participant is not None:
             connection.participant.destroy_endpoint(entity)
-        elif endpoint.kind.is_action:
+        elif kind.is_action:
             entity.destroy()
-        elif endpoint.kind is EndpointKind.PUBLISHER:
-            self._node.destroy_publisher(entity)
-        elif endpoint.kind is EndpointKind.SUBSCRIPTION:
-            self._node.destroy_subscription(entity)
-        elif endpoint.kind is EndpointKind.SERVICE_SERVER:
-            self._node.destroy_service(entity)
         else:
-            self._node.destroy_client(entity)
+            getattr(self._node, _DESTROY[kind])(entity)
 
     def expand(self, endpoint: Endpoint, name: str) -> str:
         """Return a new name for an endpoint fully qualified; no remapping rule applies.
@@ -193,8 +190,7 @@ class Maker:
             accept=goals.accept,
             group=self._group(endpoint),
         )
-        self._goals[id(server)] = goals
-        self._gate.add_worker(server, goals.close)
+        self._gate.add_worker(server, goals.end)
         return server
 
     def _action_client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:

@@ -70,13 +70,14 @@ class NodeGate:
             gated.close()
 
     def add_worker(self, entity: object, stop: Callable[[], None]) -> None:
-        """Have `stop` called before anything is closed: its last messages pass."""
+        """Have `stop` called at removal, and before anything is closed: its last messages pass."""
         self._workers[id(entity)] = stop
 
     def remove(self, entity: object) -> None:
         """Forget an entity that is being destroyed."""
         self._entities.pop(id(entity), None)
-        self._workers.pop(id(entity), None)
+        if (stop := self._workers.pop(id(entity), None)) is not None:
+            stop()
 
     def measure(self, apart: Collection[str]) -> None:
         """Count what arrives from now on by these clocks.
