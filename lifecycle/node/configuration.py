@@ -1,11 +1,8 @@
 """The node configuration document: a node's identity, its endpoints as they are, its capabilities.
 
-Owns: collecting a NodeConfiguration (schema: schemas/node_configuration.v1.schema.json) from a live
-node; the transports, wire formats and communication paradigms of each RMW, as far as this package
-can choose them (`connect_to`), which are the input of negotiation; what counts for its checksum, by
-which a reader knows that it must read it again; and one notification for all changes within one
-turn of the executor, none while there is no listener: a configuration costs a millisecond to
-collect.
+Of all changes within one turn of the executor one notification is made, and none while there is no
+listener: a configuration costs a millisecond to collect. Its schema is
+schemas/node_configuration.v1.schema.json.
 
 It is served at `~/get_configuration` and sent to a supervisor. See *Topological Discovery and
 Communication Negotiation*, "Node Configuration Interface".
@@ -19,7 +16,6 @@ import hashlib
 import os
 import threading
 import traceback
-import weakref
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +30,6 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
@@ -70,6 +65,7 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.manifest.diagnostics import Position
+    from lifecycle.node.host.adoption import Hosted
     from lifecycle.node.lifecycle.gate import Later
 
 
@@ -143,13 +139,7 @@ def checksum(configuration: NodeConfiguration) -> str:
 def connection_reports(
     spec: PlannedNode, connections: Connections, endpoints: Iterable[EndpointReport]
 ) -> tuple[ConnectionReport, ...]:
-    """Return every connection that exists or was asked for, the node's own participant first.
-
-    Args:
-        spec: what the node was planned to be.
-        connections: of the node.
-        endpoints: what it reports of its endpoints.
-    """
+    """Return every connection that exists or was asked for, the node's own participant first."""
     mapped = [each for each in endpoints if each.mapped]
 
     def report(connection: Connection) -> ConnectionReport:
@@ -171,28 +161,22 @@ def connection_reports(
 
 
 def collect(
-    node: Node,
-    spec: PlannedNode,
-    state: HostedState,
-    *,
+    hosted: Hosted,
     endpoints: Iterable[Endpoint],
     connections: Connections,
     health: HealthReport | None = None,
-    measured: Measured | None = None,
 ) -> NodeConfiguration:
-    """Return the configuration of `node` as it is now.
+    """Return the configuration of a node as it is now.
 
     Args:
-        node: the node itself.
-        spec: what it was planned to be.
-        state: its own.
+        hosted: the node.
         endpoints: all that it has, declared ones that do not exist among them.
         connections: that it has.
         health: what it says of itself; None if it says nothing.
-        measured: what its subscriptions have counted; None while it is not active.
     """
+    node, state = hosted.node, hosted.reported
     reports = endpoint_reports(node, endpoints)
-    name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
+    name, prefix = hosted.full_name, _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
         identity=Identity(
@@ -208,10 +192,10 @@ def collect(
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=reports,
-        connections=connection_reports(spec, connections, reports),
+        connections=connection_reports(hosted.spec, connections, reports),
         parameters=parameters.reports(node),
         health=health,
-        measured=measured,
+        measured=hosted.gate.measured(),
     )
     return replace(configuration, checksum=checksum(configuration))
 
@@ -294,18 +278,8 @@ def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoin
     return own[0] if len(own) == 1 else None
 
 
-_GID_PREFIXES: weakref.WeakKeyDictionary[Node, str] = weakref.WeakKeyDictionary()
-
-
 def _gid_prefix(node: Node) -> str:
     """Return the participant's part of the node's GIDs in hex; empty if unknown."""
-    known = _GID_PREFIXES.get(node, "") or _read_gid_prefix(node)
-    if known:
-        _GID_PREFIXES[node] = known
-    return known
-
-
-def _read_gid_prefix(node: Node) -> str:
     for name in ("~/transition_event", "/parameter_events"):
         topic = node.resolve_topic_name(name)
         info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)

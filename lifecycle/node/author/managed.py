@@ -211,13 +211,10 @@ class Managed:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         return configuration.collect(
-            self.node,
-            self.spec,
-            self.reported,
+            self,
             endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
             connections=self.data_layer.connections,
             health=None if self._health is None else self._health.report,
-            measured=self.gate.measured(),
         )
 
     # What the rows of the machine's table run, beside methods of gate and data layer.

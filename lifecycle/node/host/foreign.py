@@ -335,14 +335,7 @@ class ForeignNode:
                 )
             endpoints.append(each)
         endpoints += [Endpoint(planned=each) for each in declared.values()]
-        return configuration.collect(
-            self.node,
-            self.spec,
-            self.reported,
-            endpoints=endpoints,
-            connections=self._connections,
-            measured=self.gate.measured(),
-        )
+        return configuration.collect(self, endpoints, self._connections)
 
     @property
     def data_layer(self) -> DataLayer:
