@@ -1,8 +1,7 @@
 """Decorators that tie a method to a declared endpoint, and the matching of the two.
 
-Owns: `@on_message`, `@on_service`, `@on_action`, `@on_goal`, `@on_timer`, and the rule that every
-declared subscription, service server and action server has exactly one handler and every handler
-an endpoint. Pure: knows no rclpy.
+Every declared subscription, service server and action server has exactly one handler, and every
+handler an endpoint. Pure: knows no rclpy.
 """
 
 from __future__ import annotations

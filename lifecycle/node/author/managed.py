@@ -1,7 +1,6 @@
-"""The managed half of a LifecycleNode (`node.lifecycle`): machine, gate, data layer, services.
+"""The managed half of a LifecycleNode: machine, gate, data layer, services put together.
 
-Owns: putting them together for one node, and what the rows of the machine's table run. It is
-reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
+It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
 """
 
 from __future__ import annotations

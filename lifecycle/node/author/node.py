@@ -1,9 +1,7 @@
-"""LifecycleNode: the class to derive from.
+"""LifecycleNode: the class to derive from, as its author sees it.
 
-Owns: the node as its author sees it: how it is constructed, its callbacks, the signatures of
-`declare_…` and of the node interface; and which of rclpy's factories are overridden, so that what
-they make is known and sends and receives only while active. What all of it does is put together in
-managed.py.
+rclpy's factories are overridden, so that what they make is known, and sends and receives only while
+active. What all of it does is put together in managed.py.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ from lifecycle.node.author.spec import (
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
-from lifecycle.node.endpoints.endpoint import EndpointOptions, Placement, interface_name
+from lifecycle.node.endpoints.endpoint import Placement, interface_name
 from lifecycle.node.endpoints.making import resolve_name
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
@@ -420,15 +418,14 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             UnknownEndpointError: nothing, or more than one thing, is declared so.
             LifecycleError: its kind cannot have one of them, or it exists already.
         """
-        self.lifecycle.data_layer.set_options(
-            endpoint,
-            EndpointOptions(
-                callback_group=callback_group,
-                event_callbacks=event_callbacks,
-                raw=raw,
-                introspection=introspection,
-            ),
-        )
+        given = {
+            "callback_group": callback_group,
+            "event_callbacks": event_callbacks,
+            "raw": raw,
+            "introspection": introspection,
+        }
+        options = {name: value for name, value in given.items() if value not in (None, False)}
+        self.lifecycle.data_layer.set_options(endpoint, options)
 
     def _declare(
         self,

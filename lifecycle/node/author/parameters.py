@@ -1,6 +1,5 @@
 """Parameters of a node: what its interface declares, with the values the plan gives.
 
-Owns: from ParameterDeclaration to rclpy's declared parameters, and what a node reports of them.
 Values come, weakest first, from the interface's default, parameter files, and the manifest's
 `parameters:`. Parameters stay declared through cleanup, so that what an operator set survives into
 the next configure.

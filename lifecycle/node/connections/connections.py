@@ -1,8 +1,7 @@
 """The connections of one node: extra participants that its endpoints can be mapped onto.
 
-Owns: making and destroying participants beside the node's own, their names, and having their
-callbacks run where the node's own run. `connect_to` of *Topological Discovery and Communication
-Negotiation*; which endpoint is on which connection is data_layer.py's.
+`connect_to` of *Topological Discovery and Communication Negotiation*; which endpoint is on which
+connection is data_layer.py's.
 """
 
 from __future__ import annotations

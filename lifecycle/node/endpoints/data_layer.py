@@ -28,12 +28,12 @@ from lifecycle.node.connections.connections import ConnectError, Connection, Con
 from lifecycle.node.endpoints.endpoint import (
     CLIENTS,
     Endpoint,
-    EndpointOptions,
     Key,
     Placement,
     UnknownEndpointError,
     count_peers,
     find_endpoint,
+    refuse_unfit,
     watch_matches,
 )
 from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
@@ -189,7 +189,7 @@ class DataLayer:
         endpoint.size_bytes = endpoint.size_bytes if size_bytes is None else size_bytes
         self._changed()
 
-    def set_options(self, spelling: str, options: EndpointOptions) -> None:
+    def set_options(self, spelling: str, options: dict[str, Any]) -> None:
         """Keep how an endpoint is to be made.
 
         Raises:
@@ -197,7 +197,7 @@ class DataLayer:
             LifecycleError: it exists already, or its kind cannot have them.
         """
         endpoint = self.find(spelling)
-        options.refuse_unfit(endpoint.kind)
+        refuse_unfit(endpoint.kind, options)
         if endpoint.placement is not None:
             raise LifecycleError(
                 f"cannot set options of {endpoint.spelling} of {self._name}: it exists already",

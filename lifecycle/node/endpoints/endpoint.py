@@ -1,8 +1,6 @@
 """One endpoint of a node: what it is, how code wants it made, and where it is now.
 
-Owns: `Endpoint`; the meaning of a spelling in requests and messages (`video`, or
-`publishers/video`), and the error when it names nothing or too much; rclpy's matched events on our
-executor. Such an event is handled in a group of the framework's: an author's callback that awaits
+rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
 """
 
@@ -28,7 +26,6 @@ from lifecycle.plan.model import PlannedEndpoint
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.node import Node
-    from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
@@ -139,27 +136,13 @@ def watch_matches(
     return stop
 
 
-class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What only code can say of how an endpoint is made; as in rclpy's factories.
-
-    Attributes:
-        callback_group: of its callback and its events; None for the node's own choice.
-        event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
-        raw: a subscription's handler is given serialized bytes.
-        introspection: of a service server or client (REP-2012).
-    """
-
-    callback_group: CallbackGroup | None = None
-    event_callbacks: Any = None
-    raw: bool = False
-    introspection: ServiceIntrospectionState | None = None
-
-    def refuse_unfit(self, kind: EndpointKind) -> None:
-        """Raise LifecycleError for what endpoints of a kind cannot have."""
-        for name, fitting in _FITTING.items():
-            if getattr(self, name) not in (None, False) and kind not in fitting:
-                nouns = ", ".join(f"{each.noun}s" for each in fitting)
-                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
+def refuse_unfit(kind: EndpointKind, options: Iterable[str]) -> None:
+    """Raise LifecycleError for what endpoints of a kind cannot have."""
+    for name in options:
+        fitting = _FITTING.get(name, (kind,))
+        if kind not in fitting:
+            nouns = ", ".join(f"{each.noun}s" for each in fitting)
+            raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
 
 
 _FITTING = {
@@ -197,7 +180,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
-        options: how it is made, as far as code says it.
+        options: how it is made, as far as code says it by `set_options`.
     """
 
     planned: PlannedEndpoint
@@ -212,7 +195,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     given_name: str = ""
     lossy: bool | None = None
     size_bytes: int | None = None
-    options: EndpointOptions = EndpointOptions()
+    options: dict[str, Any] = {}
 
     @property
     def kind(self) -> EndpointKind:

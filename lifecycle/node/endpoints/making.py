@@ -63,7 +63,7 @@ class Maker:
         Raises:
             LifecycleError: the RMW refused, with its reason; nothing is left.
         """
-        kind, introspection = endpoint.kind, endpoint.options.introspection
+        kind, introspection = endpoint.kind, endpoint.options.get("introspection")
         make = self._served
         if kind is EndpointKind.PUBLISHER:
             make = self._publisher
@@ -113,10 +113,7 @@ class Maker:
 
     def _publisher(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
         qos = endpoint.planned.qos or QosProfile()
-        options = {
-            "callback_group": endpoint.options.callback_group,
-            "event_callbacks": endpoint.options.event_callbacks,
-        }
+        options = endpoint.options
         if connection.participant is not None:
             return connection.participant.create_publisher(endpoint.interface, name, qos, **options)
         return create_publisher(
@@ -124,7 +121,6 @@ class Maker:
         )
 
     def _subscription(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        options = endpoint.options
         make: Callable[..., Any] = functools.partial(create_subscription, self._node)
         if connection.participant is not None:
             make = connection.participant.create_subscription
@@ -134,9 +130,7 @@ class Maker:
             endpoint.handler,
             endpoint.planned.qos or QosProfile(),
             unique=endpoint.planned.unique,
-            callback_group=options.callback_group,
-            event_callbacks=options.event_callbacks,
-            raw=options.raw,
+            **endpoint.options,
         )
         gated = GatedSubscription(entity, self._turns.call_soon, counts=self._gate.counts)
         self._gate.add(entity, gated)
@@ -206,7 +200,7 @@ class Maker:
         own = self._turns.group
         if endpoint.kind not in CLIENTS:
             own = self._node.default_callback_group
-        return endpoint.options.callback_group or own
+        return endpoint.options.get("callback_group") or own
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
         """Return what an endpoint is called where it is made.

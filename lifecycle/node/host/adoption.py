@@ -1,8 +1,6 @@
 """Make the nodes of the user's classes and functions, each as one planned node.
 
-Owns: `Adoption`, which gives the nodes that a class or function constructs the names, parameters,
-remaps and participants of the plan; `Participants`, which nodes of a process share one; and what a
-class must be to be hosted.
+They get the names, parameters, remaps and participants of the plan.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 """Spin the nodes of one process, shut them down within a bound, and detect hanging callbacks.
 
-Owns: the executor's thread, signals, and the bounded way down (shutdown transitions, then leaving
-DDS), in a host and in a terminal alike; and what counts as hanging.
-
 rclpy's own signal handlers are not used: they end the context while the nodes still need it, and
 nothing could be reported or done after that.
 

@@ -1,6 +1,6 @@
 """The gate: publishers, subscriptions and timers work only while their node is active.
 
-Owns: what "gated" means for each kind of entity. A gate swaps a method instead of asking a
+A gate swaps a method instead of asking a
 question: while the node is active `publisher.publish` *is* rclpy's own method, so an open gate
 costs nothing per call, and a closed one less than any publish. Entities that tools rely on
 (`/rosout`, `/parameter_events`, `~/transition_event`, `/clock`) never pass through here.

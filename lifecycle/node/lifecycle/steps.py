@@ -1,7 +1,6 @@
 """Run the author's callbacks, sync or async, inside rclpy's executor.
 
-Owns: `Running`, by which an author's coroutine is stopped where it awaits; and how a callback's
-return value or exception becomes an outcome. An `async def` callback that exceeds its deadline gets
+An `async def` callback that exceeds its deadline gets
 `DeadlineError` thrown in, so that its traceback shows what it was waiting for. A sync callback
 cannot be interrupted in Python: it is judged when it returns, and a supervisor that lost patience
 ends the process.
