@@ -98,9 +98,7 @@ class Managed:
             self._health = HealthCheck(health, self.turns, how, changed=changed, failed=failed)
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found = Found(spec.at, changed)
-        self.data_layer = DataLayer(
-            node, spec, gate, self.turns, state=lambda: self.state, changed=changed
-        )
+        self.data_layer = DataLayer(self)
         self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
         self._machine = Machine(self, spec.timeouts)
         if served:

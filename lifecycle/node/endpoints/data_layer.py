@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
@@ -40,11 +39,10 @@ from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
 from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
-    from lifecycle.node.lifecycle.gate import NodeGate
-    from lifecycle.node.lifecycle.services import Turns
+    from lifecycle.node.author.managed import Managed
 
 _CONFIGURED = frozenset(
     {
@@ -79,12 +77,7 @@ class DataLayer:
     """Declared endpoints of one node and their mapping onto connections.
 
     Args:
-        node: whose endpoints these are.
-        spec: what it was planned to be.
-        gate: holds back its publishers and subscriptions.
-        turns: of the node's executor.
-        state: of the node, now.
-        changed: called when the node configuration has changed, match counts included.
+        managed: the node; its gate holds back publishers and subscriptions.
 
     Attributes:
         endpoints: from configure to cleanup every declared endpoint, in the order of declaration.
@@ -92,29 +85,20 @@ class DataLayer:
         is_made: connect has made all of it, or found it made by the authority.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        spec: PlannedNode,
-        gate: NodeGate,
-        turns: Turns,
-        *,
-        state: Callable[[], NodeState],
-        changed: Callable[[], None],
-    ) -> None:
-        self._node = node
-        self._name = node.get_fully_qualified_name()
-        self._spec = spec
-        self._gate = gate
-        self._turns = turns
-        self._state = state
-        self._changed = changed
-        self._maker = Maker(node, gate, turns, changed)
+    def __init__(self, managed: Managed) -> None:
+        self._managed = managed
+        self._node = managed.node
+        self._name = managed.full_name
+        spec = self._spec = managed.spec
+        self._gate = managed.gate
+        self._turns = managed.turns
+        self._changed = managed.configuration_changes.touch
+        self._maker = Maker(managed)
         self._participants = {each.name: each for each in spec.participants}
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
         self._handovers: dict[Key, tuple[Handover, Placement]] = {}
         self.endpoints: dict[Key, Endpoint] = {}
-        self.connections = Connections(node)
+        self.connections = Connections(self._node)
         self.is_made = False
 
     # What is declared.
@@ -133,7 +117,7 @@ class DataLayer:
             LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
                 declared already, it needs a handler, or it cannot be made.
         """
-        is_early = self._state() is NodeState.UNCONFIGURED
+        is_early = self._managed.state is NodeState.UNCONFIGURED
         if not is_early:
             self._refuse_late(planned)
         endpoint = self._declared.get((planned.kind, planned.name))
@@ -149,7 +133,7 @@ class DataLayer:
         return endpoint
 
     def _refuse_late(self, planned: PlannedEndpoint) -> None:
-        state = self._state()
+        state = self._managed.state
         what = (
             f"cannot declare {planned.kind.noun} {planned.name!r} while {self._name} is "
             f"{state.value!r}"
@@ -211,7 +195,7 @@ class DataLayer:
         Raises:
             UnknownEndpointError: none, or more than one, is called so.
         """
-        is_early = self._state() is NodeState.UNCONFIGURED
+        is_early = self._managed.state is NodeState.UNCONFIGURED
         declared = self._declared if is_early else self.endpoints
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
@@ -469,7 +453,7 @@ class DataLayer:
         self._changed()
 
     def _refuse_unconfigured(self, what: str) -> None:
-        state = self._state()
+        state = self._managed.state
         if state not in _CONFIGURED:
             raise NotConfiguredError(
                 f"cannot {what}: it is {state.value!r}",

@@ -26,9 +26,8 @@ from lifecycle.node.lifecycle.gate import GatedSubscription
 from lifecycle.node.lifecycle.steps import positional_count
 
 if TYPE_CHECKING:
+    from lifecycle.node.author.managed import Managed
     from lifecycle.node.connections.connections import Connection
-    from lifecycle.node.lifecycle.gate import NodeGate
-    from lifecycle.node.lifecycle.services import Turns
 
 
 _DESTROY = {
@@ -40,22 +39,16 @@ _DESTROY = {
 
 
 class Maker:
-    """Makes and destroys the entities of one node.
+    """Makes and destroys the entities of one node, whose executor runs their callbacks.
 
-    Args:
-        node: whose endpoints they are, and whose executor runs their callbacks.
-        gate: holds subscriptions back; publishers are held back by their handles.
-        turns: of the node's executor.
-        changed: called when what the node reports of an endpoint has changed.
+    Its gate holds subscriptions back; publishers are held back by their handles.
     """
 
-    def __init__(
-        self, node: Node, gate: NodeGate, turns: Turns, changed: Callable[[], None]
-    ) -> None:
-        self._node = node
-        self._gate = gate
-        self._turns = turns
-        self._changed = changed
+    def __init__(self, managed: Managed) -> None:
+        self._node = managed.node
+        self._gate = managed.gate
+        self._turns = managed.turns
+        self._changed = managed.configuration_changes.touch
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
         """Return a new rclpy entity of an endpoint on a connection.

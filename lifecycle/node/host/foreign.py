@@ -57,6 +57,8 @@ _MATCHED = {
     EndpointKind.PUBLISHER: QoSPublisherEventType.RCL_PUBLISHER_MATCHED,
     EndpointKind.SUBSCRIPTION: QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED,
 }
+_OPTIONS = ("callback_group", "event_callbacks", "publisher_class", "raw")
+"""Of rclpy's factories, which those of other participants take, too."""
 _REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
@@ -254,32 +256,25 @@ class ForeignNode:
         planned = self._planned(kind, given.get("topic"))
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
-        carrier = next(
-            (each for each in self.spec.participants if each.name == planned.participant), None
-        )
+        publishes = kind is EndpointKind.PUBLISHER
+        carrier = next((e for e in self.spec.participants if e.name == planned.participant), None)
+        if carrier is None and publishes:
+            return None  # no RMW makes one unique on a participant that others use
         qos = given["qos_profile"]
-        options: dict[str, Any] = {
-            "callback_group": given.get("callback_group"),
-            "event_callbacks": given.get("event_callbacks"),
-        }
-        if kind is EndpointKind.SUBSCRIPTION:
-            options |= {"unique": planned.unique, "raw": given.get("raw", False)}
-        elif "publisher_class" in given:
-            options["publisher_class"] = given["publisher_class"]
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
-        called: tuple[Any, ...] = (profile,)
-        if kind is EndpointKind.SUBSCRIPTION:
-            called = (given["callback"], profile)
+        called = (profile,) if publishes else (given["callback"], profile)
+        options = {name: given[name] for name in _OPTIONS if name in given}
+        if not publishes:
+            options["unique"] = planned.unique
         if carrier is None:
-            if kind is EndpointKind.PUBLISHER:
-                return None  # no RMW makes one unique on a participant that others use
-            make: Callable[..., Any] = create_subscription
-            return make(self.node, given["msg_type"], given["topic"], *called, **options)
+            return create_subscription(
+                self.node, given["msg_type"], given["topic"], *called, **options
+            )
         connection = self._connections.carrier(carrier)
         assert connection.participant is not None
-        make = connection.participant.create_publisher
-        if kind is EndpointKind.SUBSCRIPTION:
-            make = connection.participant.create_subscription
+        make: Callable[..., Any] = connection.participant.create_subscription
+        if publishes:
+            make = connection.participant.create_publisher
         entity = make(given["msg_type"], planned.resolved, *called, **options)
         self._apart[id(entity)] = connection
         return entity
