@@ -5,7 +5,6 @@ Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes these
 
 from __future__ import annotations
 
-import collections
 import concurrent.futures
 import functools
 import threading
@@ -71,10 +70,10 @@ class NodeInProcess:
         maker = maker_of(planned, (folder,))
         self._planned = planned
         self._error: BaseException | None = None
-        self._received: dict[str, collections.deque[Any]] = {}
+        self._received: dict[str, list[Any]] = {}
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
-        self._logs: collections.deque[Any] = collections.deque()
+        self._logs: list[Any] = []
         self._closed = False
         self._context = Context()
         with discovery_by_profile(ParticipantSettings.of(planned)):
@@ -108,7 +107,8 @@ class NodeInProcess:
         for each in self._planned.endpoints:
             qos = to_rclpy(each.qos)
             if each.kind is EndpointKind.PUBLISHER:
-                taken = self._received[each.name] = collections.deque()
+                taken: list[Any] = []
+                self._received[each.name] = taken
                 self.peer.create_subscription(
                     import_interface(each.type), each.resolved, taken.append, qos
                 )
@@ -227,9 +227,9 @@ class NodeInProcess:
         Raises:
             TimeoutError: there is none within `timeout_s` seconds.
         """
-        taken: collections.deque[Any] = self._declared(self._received, publisher, "publisher")
+        taken: list[Any] = self._declared(self._received, publisher, "publisher")
         self._wait(lambda: taken, f"cannot receive a message of {publisher!r}", timeout_s)
-        return taken.popleft()
+        return taken.pop(0)
 
     def call(self, service: str, request: Any, timeout_s: float = WAIT_S) -> Any:
         """Call a declared service server, by its declared name; return the response.
