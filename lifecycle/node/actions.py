@@ -6,7 +6,6 @@ that its name is what is left of theirs. `manifest.names.resolve` is the same wi
 
 from __future__ import annotations
 
-import inspect
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.lifecycle.steps import Running, error_text
+from lifecycle.node.lifecycle.steps import Running, called, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
@@ -94,9 +93,7 @@ class Goals:
         """Decide on a goal: never unless active, and as the author's method says."""
         if self._is_open() and self._accept is not None:
             try:
-                answer = self._accept(goal)
-                if inspect.isawaitable(answer):
-                    answer = await answer
+                answer = await called(self._accept, goal)
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
                 self._log.error(traceback.format_exc())
                 self._log.error(
@@ -121,16 +118,12 @@ class Goals:
         if not goal.is_active:
             return None  # interrupted before it began
         key = bytes(goal.goal_id.uuid)
-        run = self._runs[key] = Running(self._handled(goal))
+        run = self._runs[key] = Running(called(self._handler, goal))
         try:
             await run
         finally:
             is_open = self._runs.pop(key, None) is not None
         return self._outcome(goal, run) if is_open else None
-
-    async def _handled(self, goal: ServerGoalHandle) -> Any:
-        returned = self._handler(goal)
-        return await returned if inspect.isawaitable(returned) else returned
 
     def _outcome(self, goal: ServerGoalHandle, run: Running) -> Any | None:
         """Say what is wrong with what a handler did; return the result, None for none."""

@@ -23,7 +23,7 @@ from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
 from lifecycle.node.lifecycle.gate import GatedSubscription
-from lifecycle.node.lifecycle.steps import positional_count
+from lifecycle.node.lifecycle.steps import called
 
 if TYPE_CHECKING:
     from lifecycle.node.author.managed import Managed
@@ -241,9 +241,7 @@ def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
     """Let a service handler return None once it has filled in the response."""
 
     async def answer(request: Any, response: Any) -> Any:
-        returned = handler(*(request, response)[: positional_count(handler, 2)])
-        if hasattr(returned, "__await__"):
-            returned = await returned
+        returned = await called(handler, request, response)
         return response if returned is None else returned
 
     return answer

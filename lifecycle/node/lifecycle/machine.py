@@ -409,25 +409,14 @@ class Machine:
         deadline_s: float = getattr(self._timeouts, limit)
         what = f"{self._node.full_name}: {name}"
         late = DeadlineError(f"cannot finish {what} within its deadline of {deadline_s:g} s")
-        call_off: list[Callable[[], None]] = []
-
-        def started(running: Running) -> None:
-            self._running = running
-            self._what = what
-            call_off.append(self._node.turns.call_after(deadline_s, lambda: self._interrupt(late)))
-
+        running = Running(steps.called(self._node.callback(name), argument))
+        self._running, self._what = running, what
+        call_off = self._node.turns.call_after(deadline_s, lambda: self._interrupt(late))
         try:
-            return await steps.call(
-                self._node.callback(name),
-                (argument,),
-                what=what,
-                deadline_s=deadline_s,
-                started=started,
-            )
+            return await steps.result_of(running, what=what, deadline_s=deadline_s)
         finally:
             self._running = None
-            for each in call_off:
-                each()
+            call_off()
 
     def _interrupt(self, error: LifecycleError) -> None:
         """Stop the author's callback that runs; its task is resumed for the last time."""
