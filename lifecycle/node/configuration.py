@@ -163,7 +163,6 @@ def connection_reports(
 def collect(
     hosted: Hosted,
     endpoints: Iterable[Endpoint],
-    connections: Connections,
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of a node as it is now.
@@ -171,7 +170,6 @@ def collect(
     Args:
         hosted: the node.
         endpoints: all that it has, declared ones that do not exist among them.
-        connections: that it has.
         health: what it says of itself; None if it says nothing.
     """
     node, state = hosted.node, hosted.reported
@@ -192,7 +190,7 @@ def collect(
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=reports,
-        connections=connection_reports(hosted.spec, connections, reports),
+        connections=connection_reports(hosted.spec, hosted.connections, reports),
         parameters=parameters.reports(node),
         health=health,
         measured=hosted.gate.measured(),

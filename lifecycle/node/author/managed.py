@@ -60,6 +60,7 @@ class Managed:
         turns: has things done in its executor.
         spec: what the node was planned to be.
         data_layer: its endpoints.
+        connections: its participants.
         connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories.
@@ -99,6 +100,7 @@ class Managed:
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found = Found(spec.at, changed)
         self.data_layer = DataLayer(self)
+        self.connections = self.data_layer.connections
         self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
         self._machine = Machine(self, spec.timeouts)
         if served:
@@ -199,18 +201,12 @@ class Managed:
         """Bring the node to finalized from any state; a running async callback is cancelled."""
         return await self._machine.shut_down(reason)
 
-    @property
-    def marks(self) -> tuple[int | None, ...]:
-        """DSCP on the sender sockets of its participants, as it is now."""
-        return self.data_layer.connections.marks
-
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         return configuration.collect(
             self,
             endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
-            connections=self.data_layer.connections,
             health=None if self._health is None else self._health.report,
         )
 

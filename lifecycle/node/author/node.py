@@ -630,7 +630,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         return bool(super().destroy_timer(timer))
 
     def _found(self, kind: EndpointKind, entity: Any) -> None:
-        own = self.lifecycle.data_layer.connections.own
+        own = self.lifecycle.connections.own
         self.lifecycle.found.add(kind, Placement(connection=own, entity=entity))
 
     def _forget(self, entity: object) -> None:

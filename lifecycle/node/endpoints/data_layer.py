@@ -35,7 +35,7 @@ from lifecycle.node.endpoints.endpoint import (
     refuse_unfit,
     watch_matches,
 )
-from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
+from lifecycle.node.endpoints.handover import Handover
 from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
 from lifecycle.node.lifecycle.machine import NodeState
@@ -96,7 +96,6 @@ class DataLayer:
         self._maker = Maker(managed)
         self._participants = {each.name: each for each in spec.participants}
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
-        self._handovers: dict[Key, tuple[Handover, Placement]] = {}
         self.endpoints: dict[Key, Endpoint] = {}
         self.connections = Connections(self._node)
         self.is_made = False
@@ -424,9 +423,9 @@ class DataLayer:
                 hint="map its endpoints onto another connection, or take transition 'disconnect'",
             )
         for endpoint in self.endpoints.values():
-            running = self._handovers.get(endpoint.key)
-            if running is not None and found in (running[1].connection, endpoint.connection):
-                running[0].end()
+            handover = endpoint.handover
+            if handover is not None and found in (handover.old.connection, endpoint.connection):
+                handover.end()
             if endpoint.connection is found:
                 self._unmap(endpoint)
         self.connections.close(found)
@@ -440,7 +439,8 @@ class DataLayer:
         expanded = self._maker.expand(endpoint, name) if name else ""
         if expanded == before:
             return
-        self._end_handover(endpoint)
+        if endpoint.handover is not None:
+            endpoint.handover.end()
         endpoint.given_name = expanded
         old = endpoint.placement
         if old is not None:
@@ -471,7 +471,8 @@ class DataLayer:
 
     def _unmap(self, endpoint: Endpoint) -> None:
         """Take an endpoint off where it is; harmless if it is nowhere."""
-        self._end_handover(endpoint)
+        if endpoint.handover is not None:
+            endpoint.handover.end()
         placement = endpoint.placement
         if placement is None:
             return
@@ -482,15 +483,19 @@ class DataLayer:
 
     def _move(self, endpoint: Endpoint, connection: Connection) -> Future:
         """Map an endpoint onto another connection, make before break; raises LifecycleError."""
-        running = self._handovers.get(endpoint.key)
-        if endpoint.connection is connection:
-            return running[0].done if running is not None else nothing_to_hand_over()
-        self._end_handover(endpoint)
-        if endpoint.placement is not None:
-            return self._hand_over(endpoint, endpoint.placement, connection)
-        self._map(endpoint, connection)
-        endpoint.error = ""
-        return nothing_to_hand_over()
+        if endpoint.connection is not connection:
+            if endpoint.handover is not None:
+                endpoint.handover.end()
+            if endpoint.placement is None:
+                self._map(endpoint, connection)
+            else:
+                return self._hand_over(endpoint, endpoint.placement, connection)
+            endpoint.error = ""
+        elif endpoint.handover is not None:
+            return endpoint.handover.done
+        done: Future = Future()
+        done.set_result(None)
+        return done
 
     def _hand_over(self, endpoint: Endpoint, old: Placement, connection: Connection) -> Future:
         """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
@@ -499,25 +504,19 @@ class DataLayer:
         endpoint.error = ""
 
         def finish() -> None:
-            del self._handovers[endpoint.key]
+            endpoint.handover = None
             self._take_over(endpoint, old)
             self._tidy()
             self._changed()
 
         # Two servers would both answer; and a client's answers may still be under way.
         lives_on = peers > 0 if endpoint.kind.is_topic else endpoint.kind in CLIENTS
-        handover = Handover(peers_before=peers or 1, after=self._turns.call_after, finish=finish)
-        self._handovers[endpoint.key] = (handover, old)
+        handover = endpoint.handover = Handover(old, peers or 1, self._turns, finish)
         if not lives_on or self._node.executor is None:
             handover.end()
         else:
             handover.peers_changed(_peers(endpoint))
         return handover.done
-
-    def _end_handover(self, endpoint: Endpoint) -> None:
-        running = self._handovers.get(endpoint.key)
-        if running is not None:
-            running[0].end()
 
     def _take_over(self, endpoint: Endpoint, old: Placement) -> None:
         """Let the new one do what the old one did until now, which is destroyed."""
@@ -548,15 +547,14 @@ class DataLayer:
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""
-        running = self._handovers.get(endpoint.key)
-        if running is not None:
-            running[0].peers_changed(_peers(endpoint))
+        if endpoint.handover is not None:
+            endpoint.handover.peers_changed(_peers(endpoint))
         self._changed()  # as many peers as before may be others
 
     def _tidy(self) -> None:
         """Unmake participants of single flows that carry nothing any more."""
         used = [each.connection for each in self.endpoints.values()]
-        used += [old.connection for _, old in self._handovers.values()]
+        used += [each.handover.old.connection for each in self.endpoints.values() if each.handover]
         for connection in self.connections.unnamed:
             if connection not in used:
                 self.connections.close(connection)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
+    from lifecycle.node.endpoints.handover import Handover
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
 
@@ -174,6 +175,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         handler: takes messages, requests or goals; None where the kind has no handler.
         handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
+        handover: it is on two connections now; None usually.
         is_late: it was declared after configure, and goes with cleanup.
         error: why it could not be made as asked; empty if it was.
         fault: what its handler raised at the last goal of an action; empty if it returned.
@@ -189,6 +191,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     handler: Callable[..., Any] | None = None
     handle: DeclaredPublisher | None = None
     placement: Placement | None = None
+    handover: Handover | None = None
     is_late: bool = False
     error: str = ""
     fault: str = ""

@@ -110,6 +110,7 @@ class ForeignNode:
         spec: what it was planned to be.
         gate: holds back what it publishes, and counts what arrives.
         configuration_changes: notifies of each change of its configuration.
+        connections: its participants.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class ForeignNode:
         self._group = ReentrantCallbackGroup()
         self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
-        self._connections = Connections(node)
+        self.connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
@@ -194,7 +195,7 @@ class ForeignNode:
             unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
-        connection = self._apart.pop(id(entity), self._connections.own)
+        connection = self._apart.pop(id(entity), self.connections.own)
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
         endpoint = self._found.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
@@ -270,7 +271,7 @@ class ForeignNode:
             return create_subscription(
                 self.node, given["msg_type"], given["topic"], *called, **options
             )
-        connection = self._connections.carrier(carrier)
+        connection = self.connections.carrier(carrier)
         assert connection.participant is not None
         make: Callable[..., Any] = connection.participant.create_subscription
         if publishes:
@@ -330,7 +331,7 @@ class ForeignNode:
                 )
             endpoints.append(each)
         endpoints += [Endpoint(planned=each) for each in declared.values()]
-        return configuration.collect(self, endpoints, self._connections)
+        return configuration.collect(self, endpoints)
 
     @property
     def data_layer(self) -> DataLayer:
@@ -345,18 +346,13 @@ class ForeignNode:
             hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
         )
 
-    @property
-    def marks(self) -> tuple[int | None, ...]:
-        """DSCP on the sender sockets of its participants, as it is now."""
-        return self._connections.marks
-
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
         for each in self._found.endpoints.values():
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
         self._watching.drop_services(self._services)
-        self._connections.close_all()
+        self.connections.close_all()
 
     def destroyed(self) -> None:
         """The node was destroyed, in a process that goes on."""

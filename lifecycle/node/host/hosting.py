@@ -306,11 +306,11 @@ class Host:
     def _note_marks(self, node: Hosted) -> None:
         """Take the DSCP of a node's sockets that is reported now."""
         if is_marked(node):
-            self._marks[node.full_name] = node.marks
+            self._marks[node.full_name] = node.connections.marks
 
     def _has_other_marks(self, node: Hosted) -> bool:
         before = self._marks.get(node.full_name)
-        return before is not None and node.marks != before
+        return before is not None and node.connections.marks != before
 
     async def _execute(self, command: Command) -> None:
         """Carry out one command and answer it, whatever happens."""
