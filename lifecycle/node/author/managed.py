@@ -5,7 +5,6 @@ It is reached as `node.lifecycle`, so that authors have every other attribute na
 
 from __future__ import annotations
 
-import functools
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -214,12 +213,11 @@ class Managed:
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = match(type(self.node), self.data_layer.unhandled, node=self.full_name)
+        handlers, timed = match(self.node, self.data_layer.unhandled, name=self.full_name)
         parameters.declare(self.node, self.spec)
-        self.data_layer.prepare(functools.partial(matched.bound, self.node))
-        for method, period_s in matched.timers:
-            timer = self.node.create_timer(period_s, getattr(self.node, method))
-            self._method_timers.append(timer)
+        self.data_layer.prepare(handlers)
+        for method, period_s in timed:
+            self._method_timers.append(self.node.create_timer(period_s, method))
 
     def unprepare(self) -> None:
         """Undo `prepare`; parameters stay declared."""

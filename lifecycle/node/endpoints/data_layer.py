@@ -11,7 +11,7 @@ Negotiation*, "Node Interface".
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
@@ -22,12 +22,11 @@ from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.node.author.handlers import alternatives, needs_handler
+from lifecycle.node.author.handlers import Key, alternatives, needs_handler
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint import (
     CLIENTS,
     Endpoint,
-    Key,
     Placement,
     UnknownEndpointError,
     count_peers,
@@ -240,23 +239,20 @@ class DataLayer:
         """What is declared without a handler in code."""
         return tuple(e.planned for e in self._declared.values() if e.callback is None)
 
-    def prepare(self, bound: Callable[[PlannedEndpoint], Callable[..., Any]]) -> None:
+    def prepare(self, handlers: Mapping[Key, Callable[..., Any]]) -> None:
         """Import every type and make the publishers' handles; no endpoint exists yet.
 
         Args:
-            bound: returns the decorated method of one that has no handler in code.
+            handlers: decorated methods, of what has no handler in code.
 
         Raises:
             LifecycleError: types that are not installed, all of them at once.
         """
         problems: list[str] = []
         for endpoint in self._declared.values():
-            handler = endpoint.callback
-            if handler is None and needs_handler(endpoint.kind):
-                handler = bound(endpoint.planned)
             try:
-                self._prepare(endpoint, handler)
-            except LifecycleError as error:
+                self._prepare(endpoint, endpoint.callback or handlers.get(endpoint.key))
+            except LifecycleError as error:  # noqa: PERF203 - all of them are said
                 problems.append(str(error))
         if problems:
             self.unprepare()

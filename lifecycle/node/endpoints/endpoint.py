@@ -20,6 +20,7 @@ from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.node.author.handlers import Key
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from lifecycle.node.endpoints.handover import Handover
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
-
-Key = tuple[EndpointKind, str]
-"""Kind and declared name: what identifies an endpoint within its node."""
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 
