@@ -32,17 +32,7 @@ class GoalInterruptedError(LifecycleError):
 
 
 class Goals:
-    """The goals of one action server.
-
-    Args:
-        node: whose it is.
-        endpoint: the declared action server; what its handler raises is its `fault`.
-        is_open: the node is active.
-        changed: called when that fault is another one.
-
-    Attributes:
-        server: set by its maker, before it can have a goal.
-    """
+    """The goals of one action server, of which `fault` is what its handler raised last."""
 
     def __init__(
         self,
@@ -62,7 +52,7 @@ class Goals:
         self._is_open = is_open
         self._changed = changed
         self._runs: dict[bytes, Running] = {}
-        self.server: GoalServer | None = None
+        self.server: GoalServer | None = None  # set by its maker, before it can have a goal
 
     def end(self) -> None:
         """Take every goal from its handler, and answer those that wait for its result.

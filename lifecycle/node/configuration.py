@@ -343,15 +343,7 @@ def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
 
 
 class Found:
-    """The endpoints that the code of one node makes by itself, with rclpy's factories.
-
-    Args:
-        at: where the node is declared.
-        changed: called when one is made or destroyed.
-
-    Attributes:
-        endpoints: those that exist, by id of their rclpy object.
-    """
+    """The endpoints that the code of one node makes by itself, by id of their rclpy object."""
 
     def __init__(self, at: Position, changed: Callable[[], None]) -> None:
         self._at = at
@@ -391,7 +383,7 @@ class ConfigurationChanges:
     Args:
         later: runs a function in the node's executor.
         collect: returns the configuration as it is now.
-        failed: called with the traceback if it cannot be collected; no listener is notified then.
+        failed: called with the traceback if that raises; no listener is notified then.
     """
 
     def __init__(

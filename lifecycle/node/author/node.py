@@ -94,16 +94,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             def heard(self, message):
                 self.get_logger().info(f"heard {message.data}")
 
-    Without a manifest, the same class declares them itself and drives itself up:
-
-        class Talker(LifecycleNode):
-            def __init__(self):
-                super().__init__("talker", lifecycle="auto")
-                self.declare_publisher("chatter", Int32)
-                self.declare_subscription("echo", Int32)
-            ...
-
-        lifecycle.run(Talker)
+    Without a manifest, it declares them itself, `self.declare_publisher("chatter", Int32)`, and
+    drives itself up, `super().__init__("talker", lifecycle="auto")`.
 
     Callbacks `on_configure`, `on_connect`, `on_activate`, `on_deactivate`, `on_disconnect`,
     `on_cleanup`, `on_shutdown` and `on_error` take `(self, state)` or `(self)`, return SUCCESS,

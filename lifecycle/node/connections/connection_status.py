@@ -105,12 +105,7 @@ Listener = Callable[[ConnectionEvent], Any]
 
 
 class ConnectionEvents:
-    """Who is called when something becomes of one node's connections and mappings.
-
-    Args:
-        changes: of the node's configuration.
-        later: runs a function, sync or async, in the node's executor.
-    """
+    """Who is called when something becomes of one node's connections and mappings."""
 
     def __init__(self, changes: ConfigurationChanges, later: Later) -> None:
         self._changes = changes

@@ -28,7 +28,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.executors import (
-    ExternalShutdownException,
     MultiThreadedExecutor,
     ShutdownException,
 )
@@ -50,12 +49,7 @@ if TYPE_CHECKING:
 
 
 class Watchdog:
-    """Keeps the busy sign of one executor; called in its thread only.
-
-    Args:
-        sign: this process's side.
-        on_overlong: called with the seconds that a callback took which returned after all.
-    """
+    """Keeps the busy sign of one executor; called in its thread only."""
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
         self._sign = sign
@@ -101,10 +95,6 @@ class Heartbeat:
     It is in the node's default callback group: it comes late by as long as another callback of that
     group takes, or as all threads are busy. Callbacks of other groups may take as long as they like
     while a thread is left.
-
-    Args:
-        sign: this process's side.
-        on_overlong: called with the seconds that a beat came late by, beyond the limit.
     """
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
@@ -197,14 +187,6 @@ class NodeLoop:
 
     Attributes:
         watching: events that this loop waits for, whatever runs the callbacks of nodes.
-
-    Example:
-        >>> loop = NodeLoop(context)
-        >>> camera = Camera()
-        >>> loop.add(camera.lifecycle)
-        >>> ending = lambda number: loop.stop(f"signal {number}", code=0)
-        >>> with on_signal(ending):
-        ...     loop.spin_and_exit()
     """
 
     def __init__(
@@ -300,9 +282,8 @@ class NodeLoop:
         )
         if self._heartbeat is not None:
             self._heartbeat.run(runs=False)
-        guard = threading.Thread(
-            target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
-        )
+        guard = threading.Timer(bound_s, self._give_up, (bound_s, reason))
+        guard.daemon = True
         # At the limit of threads it goes without: a supervisor ends what does not end by itself.
         with contextlib.suppress(RuntimeError):
             guard.start()
@@ -318,16 +299,11 @@ class NodeLoop:
             last: is called once no callback runs any more.
         """
         if self._own is not self._executor:
-            threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
+            spin = functools.partial(self._own.spin_once, _SPIN_S)
+            threading.Thread(target=self._spin, args=(spin,), name="executor", daemon=True).start()
             if self._heartbeat is not None:
                 self._heartbeat.run(runs=True)
-        while not self._done:
-            try:
-                self.turn()
-            except ShutdownException:  # noqa: PERF203
-                pass
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
-                self._failed(error)
+        self._spin(self.turn)
         self.close()
         contexts = dict.fromkeys([self._context, *(node.context for node in self.nodes)])
         last()
@@ -358,21 +334,20 @@ class NodeLoop:
             self._own.shutdown(_LEAVE_S)
         self._executor.shutdown()
 
-    def _spin_own(self) -> None:
-        """Run the executor of nodes in this thread until it is shut down."""
+    def _spin(self, once: Callable[[], None]) -> None:
+        """Run callbacks in this thread until all is done."""
         while not self._done:
             try:
-                self._own.spin_once(_SPIN_S)
-            except (ShutdownException, ExternalShutdownException):  # noqa: PERF203
+                once()
+            except ShutdownException:  # noqa: PERF203
                 return
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code: reported
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
                 self._failed(error)
-                if not self._context.ok():
-                    return
 
     def _failed(self, error: Exception | SystemExit) -> None:
         if not self._context.ok():
-            sys.stderr.write("rclpy was shut down by a node's own code: its process ends\n")
+            if not self._done:
+                sys.stderr.write("rclpy was shut down by a node's own code: its process ends\n")
             self._done = True  # no transition can be run without it
             return
         if isinstance(error, SystemExit):
@@ -398,7 +373,6 @@ class NodeLoop:
 
     def _give_up(self, bound_s: float, reason: str) -> None:
         """End the process when a blocking callback keeps the executor from doing so."""
-        threading.Event().wait(bound_s)
         names = ", ".join(node.get_fully_qualified_name() for node in self.nodes)
         sys.stderr.write(
             f"cannot shut down {names} within {bound_s:g} s after {reason}: "
@@ -421,12 +395,10 @@ def _executor(kind: Executor, threads: int, context: Context) -> Any:
     return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
-_NONE: Mapping[int, Callable[[], bool]] = {}
-
-
 @contextlib.contextmanager
 def on_signal(
-    handler: Callable[[signal.Signals], None], beside: Mapping[int, Callable[[], bool]] = _NONE
+    handler: Callable[[signal.Signals], None],
+    beside: Mapping[int, Callable[[], bool]],
 ) -> Iterator[None]:
     """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
 

@@ -42,14 +42,7 @@ _REPEATED_AFTER_S = (0.1, 0.3)
 
 @typing.final
 class OwnLiveliness:
-    """The liveliness of one process without a supervisor.
-
-    Args:
-        limit_s: seconds, > 0, that a callback may take.
-
-    Attributes:
-        sign: for the loop that spins the node.
-    """
+    """The liveliness of one process without a supervisor; its sign is for what spins the node."""
 
     def __init__(self, limit_s: float) -> None:
         self.sign = BusySign.make(limit_s)
@@ -60,12 +53,7 @@ class OwnLiveliness:
         self._name = ""
 
     def open(self, hosted: Managed, republish_names: Callable[[], None]) -> None:
-        """Assert its liveliness from now on.
-
-        Args:
-            hosted: whose name it has.
-            republish_names: called when a subscriber is matched, which may have dropped the names.
-        """
+        """Assert its liveliness from now on; a subscriber that is matched may have lost names."""
         self._name = hosted.full_name
         self._publisher = AlivePublisher(
             hosted.node, node_alive_topic(self._name), on_listener=republish_names
@@ -159,7 +147,7 @@ def run(
         report(f"{number.name}: shutting down")
         loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
 
-    with on_signal(end):
+    with on_signal(end, {}):
         adoption = Adoption(context, loop, mode=mode, use_global_arguments=True)
         hosted: Hosted
         if spec is None:

@@ -269,11 +269,6 @@ class Machine:
     Attributes:
         state: the current state, written by `transitions` alone.
         is_permitted: the request that is looked at comes through the supervisor's gate.
-
-    Example:
-        >>> result = await machine.change(TransitionRequest.CONFIGURE)
-        >>> result.outcome, machine.state.value
-        (<CallbackOutcome.SUCCESS: 'transition_success'>, 'inactive/disconnected')
     """
 
     def __init__(self, node: Any, timeouts: Timeouts, table: Iterable[Row] = TABLE) -> None:

@@ -32,15 +32,12 @@ _TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
 def serve(
     node: Node, state_machine: Machine, group: CallbackGroup
 ) -> Callable[[machine.Transition], None]:
-    """Serve a node's state machine to `ros2 lifecycle`, launch_ros, nav2 and all others.
+    """Serve a node's state machine; returns what publishes a transition event.
 
     Args:
         node: the node to be seen as managed.
         state_machine: its state machine.
         group: must be reentrant, so that others can ask while a transition runs.
-
-    Returns:
-        What publishes a transition event.
     """
     # Not through our node's own create_publisher: this one must work in every state.
     events = Node.create_publisher(

@@ -63,8 +63,7 @@ class Running:
 
     Attributes:
         returned: what it returned.
-        failure: what it raised; None if it did not.
-        trace: of the failure.
+        failure: what it raised, whose traceback is `trace`; None if it did not.
         interruption: why it was stopped; None if it was not.
         awaits: it has awaited something: only there it can be stopped.
         done: it works no longer.
