@@ -261,7 +261,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
         nfes=_nfes(witness, endpoint.kind, entity, connection),
-        dscp=_dscp(connection),
+        dscp=connection.read_dscp(),
     )
 
 
@@ -320,13 +320,6 @@ def _nfes(
     if publishes and connection.has_shared_memory:
         return (*nfes, SHARED_MEMORY)
     return nfes
-
-
-def _dscp(connection: Connection) -> int | None:
-    try:
-        return connection.read_dscp()
-    except MiddlewareError:
-        return None  # sockets that cannot be read are "not read"
 
 
 def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:

@@ -199,11 +199,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def subscription(self, name: str) -> Subscription:
         """Return rclpy's object of the declared subscription `name`, from on_connect on.
 
-        For `get_publisher_count()` and the like; it is another one after a handover.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-            LifecycleError: the node is not connected.
+        For `get_publisher_count()` and the like; it is another one after a handover. Raises as
+        `client`.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.SUBSCRIPTION, name)
 

@@ -93,10 +93,9 @@ class DataLayer:
         self._turns = managed.turns
         self._changed = managed.configuration_changes.touch
         self._maker = Maker(managed)
-        self._participants = {each.name: each for each in spec.participants}
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
         self.endpoints: dict[Key, Endpoint] = {}
-        self.connections = Connections(self._node)
+        self.connections = Connections(self._node, spec.participants)
         self.is_made = False
 
     # What is declared.
@@ -160,7 +159,7 @@ class DataLayer:
         if not self.is_made or self._is_mapped_by_others:
             return
         try:
-            self._map(endpoint, self._default(endpoint))
+            self._map(endpoint, self.connections.planned(endpoint.planned.participant))
         except BaseException:
             self._forget(endpoint)
             raise
@@ -332,10 +331,10 @@ class DataLayer:
         try:
             for planned in self._spec.participants:
                 if planned.connection:
-                    self.connections.carrier(planned)
+                    self.connections.planned(planned.name)
             for current in self.endpoints.values():
                 if current.placement is None:
-                    self._map(current, self._default(current))
+                    self._map(current, self.connections.planned(current.planned.participant))
         except Exception as error:
             for each in reversed(self.endpoints.values()):
                 if each not in before:
@@ -349,11 +348,6 @@ class DataLayer:
             raise ConnectError(
                 f"cannot connect {current.kind.noun} {current.name!r} of {self._name}: {error}"
             ) from error
-
-    def _default(self, endpoint: Endpoint) -> Connection:
-        """Return the connection that the plan says; make its participant at first use."""
-        planned = self._participants.get(endpoint.planned.participant)
-        return self.connections.own if planned is None else self.connections.carrier(planned)
 
     def _refuse_unmapped(self) -> None:
         missing = [each.spelling for each in self.endpoints.values() if each.placement is None]
@@ -373,9 +367,8 @@ class DataLayer:
         where = ", ".join(how.urls) or repr(name)
         self._refuse_unconfigured(f"connect {self._name} to {where}")
         name = name or self.connections.free_name()
-        planned = next((each for each in self._spec.participants if each.connection == name), None)
         try:
-            return self.connections.connect_to(name, how, planned)
+            return self.connections.connect_to(name, how)
         finally:
             self._changed()
 
@@ -389,9 +382,9 @@ class DataLayer:
         endpoint = self.find(spelling)
         target = self.connections.find(connection)
         try:
-            planned = self._participants.get(endpoint.planned.participant)
-            if target is self.connections.own and planned is not None and not planned.connection:
-                target = self.connections.carrier(planned)
+            planned = endpoint.planned.participant
+            if target is self.connections.own and not self.connections.is_named(planned):
+                target = self.connections.planned(planned)
             return self._move(endpoint, target)
         except LifecycleError as error:
             message = (

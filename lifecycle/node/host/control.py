@@ -193,12 +193,10 @@ class HostChannel:
 
     def read(self) -> bytes | None:
         """Wait for the next line and return it, or None at end of file."""
-        while b"\n" not in self._received:
+        while (line := next(self.lines(), None)) is None:
             if not self.receive():
                 return None
-        line, _, rest = self._received.partition(b"\n")
-        self._received = rest
-        return bytes(line)
+        return line
 
     def receive(self) -> bool:
         """Wait for more and keep it for `lines`; False at end of file."""

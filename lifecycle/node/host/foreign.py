@@ -129,7 +129,7 @@ class ForeignNode:
         self._group = ReentrantCallbackGroup()
         self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
-        self.connections = Connections(node)
+        self.connections = Connections(node, spec.participants)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
@@ -258,8 +258,8 @@ class ForeignNode:
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
         publishes = kind is EndpointKind.PUBLISHER
-        carrier = next((e for e in self.spec.participants if e.name == planned.participant), None)
-        if carrier is None and publishes:
+        connection = self.connections.planned(planned.participant)
+        if connection.participant is None and publishes:
             return None  # no RMW makes one unique on a participant that others use
         qos = given["qos_profile"]
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
@@ -267,12 +267,10 @@ class ForeignNode:
         options = {name: given[name] for name in _OPTIONS if name in given}
         if not publishes:
             options["unique"] = planned.unique
-        if carrier is None:
+        if connection.participant is None:
             return create_subscription(
                 self.node, given["msg_type"], given["topic"], *called, **options
             )
-        connection = self.connections.carrier(carrier)
-        assert connection.participant is not None
         make: Callable[..., Any] = connection.participant.create_subscription
         if publishes:
             make = connection.participant.create_publisher
@@ -377,7 +375,7 @@ class ForeignNode:
         """Activate it, let through by the gate; what does not succeed leaves the gate closed."""
         if self.reported.label == "active" and self._let_through and self._machine is not None:
             return self._transition("activate")  # refused, and it stays as it is
-        succeeded = False
+        result: Result | None = None
         self._release()  # its on_activate may publish
         limit_s = self.spec.timeouts.activate_s
         began_s = time.monotonic()
@@ -392,11 +390,10 @@ class ForeignNode:
                     f"deadline is {limit_s:g} s"
                 )
                 self.complain(why)
-                return Result(outcome=CallbackOutcome.ERROR, error=why)
-            succeeded = result.outcome is CallbackOutcome.SUCCESS
+                result = Result(outcome=CallbackOutcome.ERROR, error=why)
             return result
         finally:
-            if not succeeded:
+            if result is None or result.outcome is not CallbackOutcome.SUCCESS:
                 self._hold()
 
     async def bring_up(self) -> Result:
