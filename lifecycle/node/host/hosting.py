@@ -15,7 +15,7 @@ import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import rclpy
@@ -105,7 +105,7 @@ class Host:
         self._is_orderly = False
         self._left = threading.Event()
         self._looks = False
-        self._measures = False
+        self._measures = spec.measures
         self._nodes: dict[str, Hosted] = {}
         self._adoption = Adoption(context, self._loop, supervisor=spec.system)
         self._marks: dict[str, tuple[int | None, ...]] = {}
@@ -117,12 +117,11 @@ class Host:
         beside = {self._channel.fileno(): self._receive}
         with on_signal(lambda number: self._end(number.name), beside):
             for index, planned in enumerate(self._spec.nodes):
+                if planned.key in self._adoption.made:
+                    continue  # by the same call as one before it
                 failure: Exception | None = None
                 try:
-                    if planned.key in self._adoption.made:
-                        continue  # by the same call as one before it
-                    maker = self._import(planned)
-                    self._construct(planned, maker)
+                    self._construct(planned, self._import(planned))
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
                 if failure is not None:
@@ -134,11 +133,6 @@ class Host:
 
     def _import(self, planned: PlannedNode) -> Callable[..., Any]:
         """Import a node's class; ending the process meanwhile need not wait for it."""
-        with self._importing():
-            return maker_of(planned, self._spec.folders)
-
-    @contextlib.contextmanager
-    def _importing(self) -> Iterator[None]:
         with self._lock:
             self._imports = True
             if self._ended:
@@ -147,7 +141,7 @@ class Host:
         quiet = () if self._loop.nodes else (signal.SIGINT, signal.SIGTERM)
         before = {number: signal.signal(number, signal.SIG_DFL) for number in quiet}
         try:
-            yield
+            return maker_of(planned, self._spec.folders)
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
@@ -201,7 +195,6 @@ class Host:
         if self._spec.joins:
             self._adoption.participants.ask_others()
         self._channel.write(Event(kind="ready"))
-        self._measures = self._spec.measures
         if self._measures or any(is_marked(hosted) for hosted in self._nodes.values()):
             self._begin_to_look()
 
