@@ -19,7 +19,6 @@ from lifecycle.manifest.model import Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.handlers import alternatives, match
-from lifecycle.node.author.spec import Mode
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.connection_status import ConnectionEvents
 from lifecycle.node.connections.node_interface import acts_of, serve_interface
@@ -54,7 +53,7 @@ class Managed:
 
     Attributes:
         node: the LifecycleNode.
-        mode: what drives the transitions.
+        auto: it brings itself up, unless its host says otherwise.
         gate: holds back what the node was made to send, receive and time.
         turns: has things done in its executor.
         spec: what the node was planned to be.
@@ -69,7 +68,7 @@ class Managed:
         self,
         node: Node,
         spec: PlannedNode,
-        mode: Mode,
+        auto: bool,
         gate: NodeGate,
         supervisor: str = "",
         *,
@@ -81,7 +80,7 @@ class Managed:
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
-        self.mode = mode
+        self.auto = auto
         self.gate = gate
         self.turns = Turns(node)
         self._listeners: list[Callable[[Managed], None]] = []

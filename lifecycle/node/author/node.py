@@ -34,10 +34,9 @@ from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
     Construction,
-    Mode,
     calling_position,
     default_name,
-    parse_mode,
+    is_auto,
     plan_without_manifest,
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
@@ -142,7 +141,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         enable_communication_interface: bool = True,
         **options: Any,
     ) -> None:
-        mode = parse_mode(lifecycle)
+        auto = is_auto(lifecycle)
         if not isinstance(enable_communication_interface, bool):
             raise TypeError(
                 f"cannot use enable_communication_interface={enable_communication_interface!r}; "
@@ -161,13 +160,13 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         self.lifecycle = Managed(
             self,
             spec,
-            by_host.mode or mode if by_host is not None else mode,
+            auto,
             self._gate,
             by_host.supervisor if by_host is not None else "",
             served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
-        if by_host is None and mode is Mode.AUTO:
+        if by_host is None and auto:
             self.lifecycle.bring_up_when_spun()
 
     @property

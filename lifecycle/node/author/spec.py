@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import importlib
 import importlib.util
 import inspect
@@ -20,38 +19,28 @@ from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.plan.model import PlannedNode
 
 
-class Mode(enum.Enum):
-    """Who drives a node's transitions."""
-
-    MANUAL = "manual"  # driven from outside: a supervisor, `ros2 lifecycle`, launch_ros, nav2
-    AUTO = "auto"  # it configures, connects and activates itself
-
-
 class Construction(msgspec.Struct, frozen=True, kw_only=True):
     """What a host says of a node that it is about to construct; it drives the node, too.
 
     Attributes:
         spec: the node's part of the plan; None for a node without a manifest.
-        mode: what drives it; None leaves that to the node's own code.
         supervisor: name of the system whose supervisor alone may activate the node, once its gate
             is open; empty for a node that runs by itself.
     """
 
     spec: PlannedNode | None
-    mode: Mode | None
     supervisor: str = ""
 
 
-def parse_mode(word: str) -> Mode:
-    """Return the Mode that `lifecycle=` spells.
+def is_auto(word: str) -> bool:
+    """Return whether a node brings itself up, as `lifecycle=` says: "auto", or "manual".
 
     Raises:
-        LifecycleError: neither "manual" nor "auto".
+        LifecycleError: neither of them.
     """
-    try:
-        return Mode(word)
-    except ValueError as error:
-        raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'") from error
+    if word not in ("manual", "auto"):
+        raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'")
+    return word == "auto"
 
 
 def default_name(node_class: type) -> str:

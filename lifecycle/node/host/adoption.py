@@ -26,7 +26,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
 from lifecycle.node.author import parameters
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, load_nodes
+from lifecycle.node.author.spec import Construction, load_nodes
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.plan.model import PlannedNode
 
@@ -91,7 +91,6 @@ class Adoption:
         context: of the process: its first nodes are constructed on it.
         loop: runs the callbacks of nodes that are not ours.
         supervisor: name of the system whose gate holds the nodes; empty for none.
-        mode: what drives the nodes; None leaves that to their own code.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
@@ -106,13 +105,11 @@ class Adoption:
         loop: NodeLoop,
         *,
         supervisor: str = "",
-        mode: Mode | None = Mode.MANUAL,
         use_global_arguments: bool = False,
     ) -> None:
         self.participants = Participants(context)
         self._loop = loop
         self._supervisor = supervisor
-        self._mode = mode
         self._use_global_arguments = use_global_arguments
         self._waiting: list[PlannedNode] = []
         self._current: PlannedNode | None = None
@@ -161,7 +158,7 @@ class Adoption:
     def make_unplanned(self, what: Callable[..., Any]) -> Managed:
         """Construct a LifecycleNode that has no plan, on the default context."""
         with self.participants.carrying(ParticipantSettings()):
-            self._unplanned = Construction(spec=None, mode=self._mode)
+            self._unplanned = Construction(spec=None)
             made: Managed = what().lifecycle
             return made
 
@@ -215,7 +212,7 @@ class Adoption:
             # Of a plain node no states are driven.
             supervisor = self._supervisor if planned.managed else ""
             node._construction = Construction(  # noqa: SLF001 - it is for us
-                spec=planned, mode=self._mode, supervisor=supervisor
+                spec=planned, supervisor=supervisor
             )
         with self.participants.carrying(ParticipantSettings.of(planned)) as context:
             yield planned.name, {**options, "context": context}

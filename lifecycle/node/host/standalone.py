@@ -30,7 +30,7 @@ from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import Mode, parse_mode
+from lifecycle.node.author.spec import is_auto
 from lifecycle.node.host.adoption import Adoption, Hosted
 from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.lifecycle.steps import CallbackOutcome
@@ -123,7 +123,7 @@ def run(
     Exit codes: 0 after SIGTERM, `interrupted` after Ctrl-C, 1 when a callback raised an exception,
     6 when the node could not be brought up.
     """
-    mode = parse_mode(lifecycle) if lifecycle is not None else None
+    auto = lifecycle is not None and is_auto(lifecycle)
     settings = ParticipantSettings() if spec is None else ParticipantSettings.of(spec)
     with discovery_by_profile(settings):
         rclpy.init(
@@ -148,7 +148,7 @@ def run(
         loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
 
     with on_signal(end, {}):
-        adoption = Adoption(context, loop, mode=mode, use_global_arguments=True)
+        adoption = Adoption(context, loop, use_global_arguments=True)
         hosted: Hosted
         if spec is None:
             hosted = adoption.make_unplanned(node_class)
@@ -160,11 +160,9 @@ def run(
             liveliness.open(hosted, loop.republish_names)
         hosted.add_listener(lambda _: report(f"{name}: {_state(hosted)}"))
         report(f"{name}: {_state(hosted)}")
-        if isinstance(hosted, Managed):
-            drives_itself = hosted.mode is Mode.AUTO
-        else:
-            drives_itself = mode is Mode.AUTO and hosted.spec.managed
-        if drives_itself:
+        if lifecycle is None:
+            auto = isinstance(hosted, Managed) and hosted.auto
+        if auto and hosted.spec.managed:
             loop.call_soon(_bring_up, hosted, loop)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")

@@ -28,7 +28,6 @@ from lifecycle.node.lifecycle import steps
 from lifecycle.node.lifecycle.steps import (
     SUCCESS,
     CallbackOutcome,
-    CancelledError,
     DeadlineError,
     Result,
     Running,
@@ -359,7 +358,7 @@ class Machine:
         A running async callback is cancelled first; each step keeps its own deadline.
         """
         if not self.state.steady:
-            self._interrupt(CancelledError(f"cannot go on with {self._what}: {reason}"))
+            self._interrupt(LifecycleError(f"cannot go on with {self._what}: {reason}"))
             while not self.state.steady:
                 await _NextTurn()
         if self.state is NodeState.FINALIZED:

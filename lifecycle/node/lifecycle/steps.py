@@ -33,10 +33,6 @@ class DeadlineError(LifecycleError):
     """A transition callback took longer than its deadline."""
 
 
-class CancelledError(LifecycleError):
-    """A running transition was cancelled because its process must end."""
-
-
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a step.
 
