@@ -54,8 +54,9 @@ def overrides(spec: PlannedNode) -> list[Parameter]:
     return found
 
 
-def planned_options(spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return keywords of rclpy's Node with the plan's remaps, parameter files and values added."""
+def planned_options(node: Node, spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keywords to construct a node with: the plan's remaps, parameter files and values."""
+    _give_empty_arrays(node, spec)
     return {
         **options,
         "cli_args": [*ros_arguments(spec), *(options.get("cli_args") or ())],
@@ -63,7 +64,7 @@ def planned_options(spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def give_empty_arrays(node: Node, spec: PlannedNode) -> None:
+def _give_empty_arrays(node: Node, spec: PlannedNode) -> None:
     """Have a node that is about to be constructed declare its empty arrays with their type.
 
     Neither rcl's parameter files nor rclpy's overrides and defaults have an empty array of another

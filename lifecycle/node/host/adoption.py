@@ -204,10 +204,9 @@ class Adoption:
             yield name, options
             return
         refuse_unmanaged(planned, type(node))
-        options = parameters.planned_options(planned, options)
+        options = parameters.planned_options(node, planned, options)
         options["namespace"] = planned.namespace
         options["use_global_arguments"] = self._use_global_arguments
-        parameters.give_empty_arrays(node, planned)
         if ours:
             # Of a plain node no states are driven.
             supervisor = self._supervisor if planned.managed else ""

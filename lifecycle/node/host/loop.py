@@ -57,10 +57,6 @@ class Watchdog:
         self._running = False
         self._changing: set[str] = set()
 
-    def add(self, hosted: Hosted) -> None:
-        """Leave the transitions of a node to their own deadlines."""
-        hosted.add_listener(self._follow)
-
     def begin(self, entity: Any) -> None:
         """Note that a callback begins, and of what it is; None for a task."""
         self._running = True
@@ -72,7 +68,7 @@ class Watchdog:
         self._running = False
         self._idle()
 
-    def _follow(self, hosted: Hosted) -> None:
+    def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends, inside a callback as everything does."""
         name = hosted.full_name
         if not hosted.reported.steady:
@@ -108,10 +104,6 @@ class Heartbeat:
         self._runs = False
         sign.speak_for_process()
 
-    def add(self, hosted: Hosted) -> None:
-        """Leave the transitions of a node to their own deadlines."""
-        hosted.add_listener(self._follow)
-
     def run(self, *, runs: bool) -> None:
         """Watch from now on, as the executor runs, or nothing any more."""
         with self._lock:
@@ -146,7 +138,7 @@ class Heartbeat:
         if late_s >= self._sign.limit_s:
             self._on_overlong(late_s)
 
-    def _follow(self, hosted: Hosted) -> None:
+    def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends: meanwhile nothing else of its group runs."""
         with self._lock:
             if not hosted.reported.steady:
@@ -228,7 +220,7 @@ class NodeLoop:
         self._hosted.append(hosted)
         for each in (self._watchdog, self._heartbeat):
             if each is not None:
-                each.add(hosted)
+                hosted.add_listener(each.follow)  # transitions have deadlines of their own
         if isinstance(hosted, Managed):
             self.spin(hosted.node)
 

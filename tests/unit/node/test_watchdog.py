@@ -67,7 +67,7 @@ def dog(sign: Sign, overlong: list[float]) -> Watchdog:
 
 def added(dog: Watchdog, name: str) -> Node:
     node = Node(name)
-    dog.add(node.lifecycle)  # type: ignore[arg-type]
+    node.lifecycle.add_listener(dog.follow)
     return node
 
 
