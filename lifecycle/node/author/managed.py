@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
-from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
@@ -53,6 +52,8 @@ class Managed:
 
     Attributes:
         node: the LifecycleNode.
+        full_name: its name, fully qualified.
+        listeners: are called with it after every change of state, whatever caused it.
         auto: it brings itself up, unless its host says otherwise.
         gate: holds back what the node was made to send, receive and time.
         turns: has things done in its executor.
@@ -76,6 +77,7 @@ class Managed:
         health: Callable[[], Any] | None = None,
     ) -> None:
         self.node = node
+        self.full_name = str(node.get_fully_qualified_name())
         self.spec = spec
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
@@ -83,7 +85,7 @@ class Managed:
         self.auto = auto
         self.gate = gate
         self.turns = Turns(node)
-        self._listeners: list[Callable[[Managed], None]] = []
+        self.listeners: list[Callable[[Any], None]] = []
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
         self._publish: Callable[[Transition], None] = lambda _: None
@@ -109,11 +111,6 @@ class Managed:
             self._join()
 
     @property
-    def full_name(self) -> str:
-        """Fully qualified node name."""
-        return str(self.node.get_fully_qualified_name())
-
-    @property
     def state(self) -> NodeState:
         """The state, nested ones distinguished; `state.seen` is what other tools see."""
         return self._machine.state
@@ -123,10 +120,6 @@ class Managed:
         """The state, as it is reported to a supervisor."""
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
-
-    def add_listener(self, listener: Callable[[Managed], None]) -> None:
-        """Call `listener(self)` after every change of state, whatever caused it."""
-        self._listeners.append(listener)
 
     async def change(self, request: TransitionRequest | str) -> Result:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
@@ -180,12 +173,6 @@ class Managed:
             await self.bring_up()
 
         end = self.turns.call_every(0.0, once)
-
-    def sleep(self, seconds: float) -> Future:
-        """Return what is done in `seconds`, in every state."""
-        future: Future = Future()
-        self.turns.call_after(seconds, lambda: future.set_result(None))
-        return future
 
     def close(self) -> None:
         """Leave the graph and take the data layer away: the node is being destroyed."""
@@ -262,7 +249,7 @@ class Managed:
             self._reporter.report(state=state.seen.label, connected=state.connected)
         if self._health is not None:
             self._health.follow(state)
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(self)
 
     # What the machine needs for the author's callbacks.

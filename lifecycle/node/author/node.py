@@ -222,7 +222,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         For `async def` callbacks, above all handlers of actions: whatever else the node has to do
         goes on meanwhile, requests to cancel a goal included.
         """
-        return self.lifecycle.sleep(seconds)
+        future: Future = Future()
+        self.lifecycle.turns.call_after(seconds, lambda: future.set_result(None))
+        return future
 
     def undeclare_parameter(self, name: str) -> None:
         """As rclpy's, which notifies nothing; the node's configuration has changed."""

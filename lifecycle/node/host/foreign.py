@@ -107,21 +107,17 @@ class ForeignNode:
 
     Attributes:
         node: rclpy's.
+        full_name: its name, fully qualified.
+        listeners: are called with it after every change of state, whatever caused it.
         spec: what it was planned to be.
         gate: holds back what it publishes, and counts what arrives.
         configuration_changes: notifies of each change of its configuration.
         connections: its participants.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        spec: PlannedNode,
-        *,
-        supervisor: str,
-        loop: NodeLoop,
-    ) -> None:
+    def __init__(self, node: Node, spec: PlannedNode, *, supervisor: str, loop: NodeLoop) -> None:
         self.node = node
+        self.full_name = str(node.get_fully_qualified_name())
         self.spec = spec
         self._supervisor = supervisor
         self._loop = loop
@@ -131,10 +127,9 @@ class ForeignNode:
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self.connections = Connections(node, spec.participants)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
-        self._listeners: list[Callable[[Any], None]] = []
+        self.listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
-        self._is_ours = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
@@ -151,19 +146,12 @@ class ForeignNode:
     def _serve(self) -> tuple[Any, ...]:
         """Offer what others know our nodes by; the host answers, also while the node is held."""
         before = set(self.node.services)
-        self._is_ours = True
         configuration.serve(self.node, self.get_configuration, self._group)
         # With it a node is known to be one of ours.
         serve_interface(self.node, {"map_to": lambda _: self.data_layer}, self._group)
-        self._is_ours = False
         services = tuple(each for each in self.node.services if each not in before)
         self._watching.take_services(self.node, services)
         return services
-
-    @property
-    def full_name(self) -> str:
-        """Fully qualified node name."""
-        return str(self.node.get_fully_qualified_name())
 
     @property
     def reported(self) -> HostedState:
@@ -173,16 +161,10 @@ class ForeignNode:
         label = self._machine.label
         return HostedState(label=label, connected=label in _CONNECTED, steady=label in _STEADY)
 
-    def add_listener(self, listener: Callable[[Any], None]) -> None:
-        """Call `listener(self)` after every change of state, whatever caused it."""
-        self._listeners.append(listener)
-
     # What its class makes.
 
     def made(self, kind: EndpointKind, entity: Any) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
-        if self._is_ours:
-            return
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
@@ -426,7 +408,7 @@ class ForeignNode:
         if self._supervisor and self.reported.label in ("unconfigured", "finalized"):
             self._let_through = False
             self.gate.close()
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(self)
 
     def complain(self, text: str) -> None:

@@ -184,7 +184,7 @@ class Host:
             self._nodes[hosted.full_name] = hosted
             hosted.gate.measure(self._spec.apart)
             if hosted.spec.managed:
-                hosted.add_listener(self._report_state)
+                hosted.listeners.append(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
             self._loop.add(hosted)
 

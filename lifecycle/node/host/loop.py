@@ -220,7 +220,7 @@ class NodeLoop:
         self._hosted.append(hosted)
         for each in (self._watchdog, self._heartbeat):
             if each is not None:
-                hosted.add_listener(each.follow)  # transitions have deadlines of their own
+                hosted.listeners.append(each.follow)  # transitions have deadlines of their own
         if isinstance(hosted, Managed):
             self.spin(hosted.node)
 

@@ -158,7 +158,7 @@ def run(
         loop.add(hosted)
         if isinstance(hosted, Managed):
             liveliness.open(hosted, loop.republish_names)
-        hosted.add_listener(lambda _: report(f"{name}: {_state(hosted)}"))
+        hosted.listeners.append(lambda _: report(f"{name}: {_state(hosted)}"))
         report(f"{name}: {_state(hosted)}")
         if lifecycle is None:
             auto = isinstance(hosted, Managed) and hosted.auto

@@ -61,7 +61,7 @@ def _late() -> Any:
 def _node(activate: Any) -> ForeignNode:
     node = ForeignNode.__new__(ForeignNode)
     members: dict[str, Any] = {
-        "node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
+        "full_name": "/base",
         "gate": NodeGate(),
         "_machine": Machine(activate),
         "_is_constructed": True,
