@@ -556,8 +556,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
             self._found(EndpointKind.SUBSCRIPTION, subscription)
-            later, counts = self.lifecycle.turns.call_soon, self._gate.counts
-            gated = GatedSubscription(subscription, later, counts=counts)
+            later = self.lifecycle.turns.call_soon
+            gated = GatedSubscription(subscription, self._gate, later)
             self._gate.add(subscription, gated)
         return subscription
 

@@ -125,8 +125,7 @@ class Maker:
             unique=endpoint.planned.unique,
             **endpoint.options,
         )
-        gated = GatedSubscription(entity, self._turns.call_soon, counts=self._gate.counts)
-        self._gate.add(entity, gated)
+        self._gate.add(entity, GatedSubscription(entity, self._gate, self._turns.call_soon))
         return entity
 
     def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:

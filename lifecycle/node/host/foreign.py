@@ -171,7 +171,7 @@ class ForeignNode:
         if kind is EndpointKind.PUBLISHER:
             self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self.gate.add(entity, CountedSubscription(entity, counts=self.gate.counts))
+            self.gate.add(entity, CountedSubscription(entity, self.gate))
         unwatch: Callable[[], None] | None = None
         if kind.is_topic:
             unwatch = self._watch_matches(kind, entity)

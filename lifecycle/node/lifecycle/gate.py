@@ -51,12 +51,13 @@ class NodeGate:
     Attributes:
         counts: as given.
         is_open: data may flow.
+        apart: topics that are published by another host's clock.
     """
 
     def __init__(self, *, counts: bool = True) -> None:
         self.counts = counts
         self.is_open = False
-        self._apart: frozenset[str] = frozenset()
+        self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Callable[[], None]] = {}
         self._opened_ns = 0
@@ -64,10 +65,7 @@ class NodeGate:
     def add(self, entity: object, gated: Gated) -> None:
         """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
-        if self.is_open:
-            self._open(gated)
-        else:
-            gated.close()
+        (gated.open if self.is_open else gated.close)()
 
     def add_worker(self, entity: object, stop: Callable[[], None]) -> None:
         """Have `stop` called at removal, and before anything is closed: its last messages pass."""
@@ -80,23 +78,22 @@ class NodeGate:
             stop()
 
     def measure(self, apart: Collection[str]) -> None:
-        """Count what arrives from now on by these clocks.
+        """Count what arrives from now on; `apart`: what is published by another host's clock."""
+        self.apart = apart
+        for gated in self._counted if self.is_open else ():
+            gated.open()
 
-        Args:
-            apart: topics that are published by another host's clock.
-        """
-        self._apart = frozenset(apart)
-        for gated in tuple(self._entities.values()):
-            if self.is_open and isinstance(gated, CountedSubscription):
-                self._open(gated)
+    @property
+    def _counted(self) -> list[CountedSubscription]:
+        entities = tuple(self._entities.values())
+        return [each for each in entities if isinstance(each, CountedSubscription)]
 
     def measured(self) -> Measured | None:
         """Return what subscriptions have counted; None while it is closed. From any thread."""
         if not self.is_open:
             return None
         now_ns = time.monotonic_ns()
-        entities = tuple(self._entities.values())
-        counts = (each.sample(now_ns) for each in entities if isinstance(each, CountedSubscription))
+        counts = (each.sample(now_ns) for each in self._counted)
         return Measured(
             active_s=(now_ns - self._opened_ns) / 1e9,
             samples=tuple(each for each in counts if each is not None),
@@ -106,12 +103,7 @@ class NodeGate:
         """Open every entity; the node became active."""
         self.is_open, self._opened_ns = True, time.monotonic_ns()
         for gated in tuple(self._entities.values()):
-            self._open(gated)
-
-    def _open(self, gated: Gated) -> None:
-        if isinstance(gated, CountedSubscription):
-            gated.is_apart = gated.topic in self._apart
-        gated.open()
+            gated.open()
 
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
@@ -154,55 +146,44 @@ class CountedSubscription:
     rclpy decides by the callback's signature, once per message, whether to pass the message info. A
     callback of ours takes it always, so that a swap between take and call changes nothing.
 
-    Args:
-        subscription: rclpy's.
-        counts: false leaves its callback as it is.
-
-    Attributes:
-        topic: fully qualified.
-        is_apart: it is published by another host's clock.
-
     Raises:
-        LifecycleError: its callback takes message info, and there is none.
+        LifecycleError: its callback takes message info, and its node's gate counts nothing.
     """
 
-    def __init__(self, subscription: Subscription, *, counts: bool = True) -> None:
+    def __init__(self, subscription: Subscription, gate: NodeGate) -> None:
         self._subscription = subscription
-        self.topic = str(subscription.topic_name)
-        self.is_apart = False
-        self._counts = counts
-        self._is_open = False
+        self._topic = str(subscription.topic_name)
+        self._gate = gate
         self._call = subscription.callback
         self._counter: Counter | None = None
         takes_one = _takes_one(self._call)
-        if not counts and not takes_one:
+        if not gate.counts and not takes_one:
             raise LifecycleError(
-                f"cannot give the callback of {self.topic!r} message info with 'executor: events'",
+                f"cannot give the callback of {self._topic!r} message info with 'executor: events'",
                 hint="have it take the message alone, or choose another executor",
             )
-        if counts and takes_one:
+        if gate.counts and takes_one:
             self._call = _taking_info(self._call)
 
     def open(self) -> None:
         """Count from now on."""
-        self._is_open = True
-        if not self._counts:
+        is_apart = self._topic in self._gate.apart
+        if not self._gate.counts:
             self._subscription.callback = self._call
-        elif self._counter is None or self._counter.is_apart is not self.is_apart:
+        elif self._counter is None or self._counter.is_apart is not is_apart:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-            self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
+            self._counter = Counter(now_ns, wall_ns, is_apart=is_apart)
             self._subscription.callback = counting(self._call, self._counter)
 
     def close(self) -> None:
         """Count no more."""
-        self._is_open = False
         self._counter = None
         self._subscription.callback = self._call
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""
         counter = self._counter
-        return None if counter is None else (self.topic, counter.sample(now_ns))
+        return None if counter is None else (self._topic, counter.sample(now_ns))
 
 
 class GatedSubscription(CountedSubscription):
@@ -212,8 +193,8 @@ class GatedSubscription(CountedSubscription):
     once. So the last `depth` of those are kept while closed and given to the callback when opened.
     """
 
-    def __init__(self, subscription: Subscription, later: Later, *, counts: bool = True) -> None:
-        super().__init__(subscription, counts=counts)
+    def __init__(self, subscription: Subscription, gate: NodeGate, later: Later) -> None:
+        super().__init__(subscription, gate)
         self._later = later
         qos = subscription.qos_profile
         self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
@@ -230,7 +211,7 @@ class GatedSubscription(CountedSubscription):
     def close(self) -> None:
         """Drop messages."""
         super().close()
-        self._subscription.callback = self._drop if self._counts else self._keep
+        self._subscription.callback = self._drop if self._gate.counts else self._keep
 
     def _drop(self, message: object, info: Info) -> None:
         self._keep(message, info)
@@ -241,7 +222,7 @@ class GatedSubscription(CountedSubscription):
 
     async def _deliver(self) -> None:
         # Closed again before this ran: then what was kept stays kept.
-        while self._kept and self._is_open:
+        while self._kept and self._gate.is_open:
             returned = self._call(*self._kept.popleft())
             if inspect.isawaitable(returned):
                 await returned
