@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from lifecycle.middleware.services.actions import GoalServer
     from lifecycle.node.endpoints.endpoint import Endpoint
+    from lifecycle.node.lifecycle.gate import NodeGate
 
 
 class GoalInterruptedError(LifecycleError):
@@ -38,8 +39,7 @@ class Goals:
         self,
         node: Node,
         endpoint: Endpoint,
-        *,
-        is_open: Callable[[], bool],
+        gate: NodeGate,
         changed: Callable[[], None],
     ) -> None:
         assert endpoint.handler is not None
@@ -49,7 +49,7 @@ class Goals:
         self._log = node.get_logger()
         self._handler = endpoint.handler
         self._accept = getattr(endpoint.handler, "accept", None)
-        self._is_open = is_open
+        self._gate = gate
         self._changed = changed
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None  # set by its maker, before it can have a goal
@@ -60,7 +60,7 @@ class Goals:
         A handler that causes this by what it does itself is left alone: it can still return.
         """
         reason = f"{self._node} is no longer active"
-        if self._is_open():
+        if self._gate.is_open:
             reason = "it was taken off where it was mapped"
         if self.server is None:
             return
@@ -81,7 +81,7 @@ class Goals:
 
     async def accept(self, goal: Any) -> bool:
         """Decide on a goal: never unless active, and as the author's method says."""
-        if self._is_open() and self._accept is not None:
+        if self._gate.is_open and self._accept is not None:
             try:
                 answer = await called(self._accept, goal)
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
@@ -99,9 +99,9 @@ class Goals:
                 return False
             if not answer:
                 return False
-        if not self._is_open():
+        if not self._gate.is_open:
             self._log.warning(f"cannot accept a goal of {self._what}: it is not active")
-        return self._is_open()
+        return self._gate.is_open
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
         """Have the handler work on a goal; returns its result, None for an empty one."""

@@ -130,69 +130,51 @@ class Maker:
 
     def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
         """Make an end of a service or an action."""
-        kind = endpoint.kind
-        makes = {
-            EndpointKind.SERVICE_SERVER: self._service,
-            EndpointKind.SERVICE_CLIENT: self._client,
-            EndpointKind.ACTION_SERVER: self._action_server,
-            EndpointKind.ACTION_CLIENT: self._action_client,
-        }
+        make = functools.partial(self._served_on, endpoint, name=name)
         # rcl applies rules to an action's hidden names itself; torn apart, it is not made.
-        is_torn = kind.is_action and connection.participant is None
-        resolved = resolve_action_name(self._node, name) if is_torn else name
-        make = functools.partial(makes[kind], endpoint, name=name)
-        if connection.participant is None:
-            entity = make(self._node)
+        resolved = name
+        if connection.participant is not None:
+            entity = connection.participant.create(make, endpoint.kind.noun, name)
         else:
-            entity = connection.participant.create(make, kind.noun, name)
-        if kind.is_action:
+            if endpoint.kind.is_action:
+                resolved = resolve_action_name(self._node, name)
+            entity = make(self._node)
+        if endpoint.kind.is_action:
             entity.action_name = resolved
         return entity
 
-    def _service(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+    def _served_on(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+        kind, interface = endpoint.kind, endpoint.interface
+        # Answers of clients arrive while callbacks run.
+        own = self._turns.group if kind in CLIENTS else self._node.default_callback_group
+        group = endpoint.options.get("callback_group") or own
+        if kind.is_action:
+            # Late: numpy, 100 ms.
+            from lifecycle.middleware.services.actions import GoalClient, GoalServer
+
+            if kind is EndpointKind.ACTION_CLIENT:
+                return GoalClient(
+                    node, interface, name, group=group, refuse_to_block=refuse_to_block
+                )
+            goals = Goals(self._node, endpoint, self._gate, self._changed)
+            goals.server = GoalServer(
+                node, interface, name, goals.execute, accept=goals.accept, group=group
+            )
+            self._gate.add_worker(goals.server, goals.end)
+            return goals.server
+        options: dict[str, Any] = {"callback_group": group}
+        if endpoint.planned.qos is not None:
+            options["qos_profile"] = to_rclpy(endpoint.planned.qos)
+        if kind is EndpointKind.SERVICE_CLIENT:
+            client = Node.create_client(node, interface, name, **options)
+            refuse_to_deadlock(client)
+            return client
         assert endpoint.handler is not None
-        handler = _answering(endpoint.handler)
-        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        service = Node.create_service(node, endpoint.interface, name, handler, **options)
+        service = Node.create_service(
+            node, interface, name, _answering(endpoint.handler), **options
+        )
         self._survive_late_answers(service, endpoint.name)
         return service
-
-    def _client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        client = Node.create_client(node, endpoint.interface, name, **options)
-        refuse_to_deadlock(client)
-        return client
-
-    def _action_server(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
-
-        is_open, changed = lambda: self._gate.is_open, self._changed
-        goals = Goals(self._node, endpoint, is_open=is_open, changed=changed)
-        server = goals.server = GoalServer(
-            node,
-            endpoint.interface,
-            name,
-            goals.execute,
-            accept=goals.accept,
-            group=self._group(endpoint),
-        )
-        self._gate.add_worker(server, goals.end)
-        return server
-
-    def _action_client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        from lifecycle.middleware.services.actions import GoalClient
-
-        group = self._group(endpoint)
-        return GoalClient(
-            node, endpoint.interface, name, group=group, refuse_to_block=refuse_to_block
-        )
-
-    def _group(self, endpoint: Endpoint) -> Any:
-        """Return its callback group: answers of clients arrive while callbacks run."""
-        own = self._turns.group
-        if endpoint.kind not in CLIENTS:
-            own = self._node.default_callback_group
-        return endpoint.options.get("callback_group") or own
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
         """Return what an endpoint is called where it is made.
@@ -227,13 +209,6 @@ def resolve_name(node: Node, kind: EndpointKind, name: str) -> str:
         return resolve_action_name(node, name)
     resolve = node.resolve_topic_name if kind.is_topic else node.resolve_service_name
     return str(resolve(name))
-
-
-def _qos(endpoint: Endpoint) -> dict[str, Any]:
-    """Return the keyword for a declared QoS; nothing keeps the default for services."""
-    if endpoint.planned.qos is None:
-        return {}
-    return {"qos_profile": to_rclpy(endpoint.planned.qos)}
 
 
 def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
