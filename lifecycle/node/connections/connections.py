@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -64,10 +64,7 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
         return None if self.participant is None else self.participant.node
 
     def read_dscp(self) -> int | None:
-        """Return the DSCP on the participant's sender sockets, 0–63; None: cannot be read.
-
-        None of the node's own participant, too.
-        """
+        """Return the DSCP on its sender sockets, 0–63; None where that is not known."""
         if self.participant is None:
             return None
         try:
@@ -97,11 +94,6 @@ class Connections:
     def named(self) -> tuple[Connection, ...]:
         """Those with a name of their own, in the order in which they were made."""
         return tuple(each for each in self._made.values() if each.name)
-
-    @property
-    def unnamed(self) -> tuple[Connection, ...]:
-        """Those that only give a publisher its own flow."""
-        return tuple(each for each in self._made.values() if not each.name)
 
     @property
     def failed(self) -> tuple[Connection, ...]:
@@ -200,6 +192,12 @@ class Connections:
         participant, connection.participant = connection.participant, None
         if participant is not None:
             participant.destroy()
+
+    def close_unused(self, used: Collection[Connection | None]) -> None:
+        """Unmake participants of single flows that carry nothing any more."""
+        for each in tuple(self._made.values()):
+            if not each.name and each not in used:
+                self.close(each)
 
     def forget(self, name: str) -> bool:
         """Forget a connection that could not be made; returns whether there was one."""

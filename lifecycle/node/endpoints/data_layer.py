@@ -541,12 +541,9 @@ class DataLayer:
         self._changed()  # as many peers as before may be others
 
     def _tidy(self) -> None:
-        """Unmake participants of single flows that carry nothing any more."""
         used = [each.connection for each in self.endpoints.values()]
         used += [each.handover.old.connection for each in self.endpoints.values() if each.handover]
-        for connection in self.connections.unnamed:
-            if connection not in used:
-                self.connections.close(connection)
+        self.connections.close_unused(used)
 
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets.

@@ -365,14 +365,13 @@ class ForeignNode:
             result = self._transition("activate")
             took_s = time.monotonic() - began_s
             if result.outcome is CallbackOutcome.SUCCESS and took_s >= limit_s:
-                # Nobody waits for it any more.
-                self._transition("deactivate")
                 why = (
                     f"cannot accept {self.full_name}: on_activate blocked for {took_s:.1f} s, its "
                     f"deadline is {limit_s:g} s"
                 )
-                self.complain(why)
                 result = Result(outcome=CallbackOutcome.ERROR, error=why)
+                self.complain(why)
+                self._transition("deactivate")  # nobody waits for it any more
             return result
         finally:
             if result is None or result.outcome is not CallbackOutcome.SUCCESS:
