@@ -22,7 +22,6 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
-from lifecycle.node.author.managed import Managed
 from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
@@ -180,13 +179,12 @@ class NodeInProcess:
             BringUpError: a callback returned FAILURE or ERROR, raised, or took too long.
             LifecycleError: it is not allowed in this state, or there is none of this name.
         """
-        hosted = self._hosted
         if not self._planned.managed:
             raise UsageError(
                 f"cannot {transition} {self._planned.full_name}: a plain node has no states"
             )
-        change = hosted.change if isinstance(hosted, Managed) else hosted.change_for_supervisor
-        result: Result = self.run(lambda: change(transition), self._limit_s)
+        change = functools.partial(self._hosted.change_for_supervisor, transition)
+        result: Result = self.run(change, self._limit_s)
         if result.outcome is not CallbackOutcome.SUCCESS:
             raise BringUpError(f"cannot {transition} {self._planned.full_name}: {result.error}")
 
