@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from lifecycle.errors import BringUpError, LifecycleError, nearest
+from lifecycle.errors import BringUpError, LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.plan.model import PlannedNode
@@ -129,11 +129,10 @@ def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any
         for each, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Node)
     ]
-    near = nearest(name, nodes)
     what = "has no" if found is None else "has, but not as a node class or a function,"
     raise BringUpError(
         f"cannot use {reference!r}: {module_name} {what} {name!r}",
-        hint=f"did you mean {near!r}?" if near else f"node classes there: {nodes or 'none'}",
+        hint=did_you_mean(name, nodes) or f"node classes there: {nodes or 'none'}",
     )
 
 
