@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import time
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.manifest.model import Health
@@ -62,22 +62,17 @@ class HealthCheck:
         """Begin to ask, ask again or stop, as the node's new state says."""
         if not state.steady:
             return
+        self._asked_s = None  # what it says of the state before counts no more
+        self._round += 1
         if not state.connected:
-            self._stop()
+            if self._end is not None:
+                self._end()
+            self._end = self.report = None
             return
         if self._end is None:
             self._end = self._turns.call_every(self._how.interval_s, self._ask)
-        self._asked_s = None  # what it says of the state before counts no more
         self._is_stale = True
-        self._round += 1
         self._ask()
-
-    def _stop(self) -> None:
-        if self._end is not None:
-            self._end()
-            self._end = None
-        self._round += 1
-        self._asked_s = self.report = None
 
     def _ask(self) -> None:
         if self._asked_s is not None:
@@ -100,18 +95,15 @@ class HealthCheck:
         round_ = self._round
 
         async def wait() -> None:
-            report = await self._awaited(answer)
+            try:
+                report = _report(await answer)
+            except Exception as error:  # noqa: BLE001 - the user's code: reported
+                report = self._raised(error)
             if round_ == self._round:
                 self._asked_s = None
                 self._take(report)
 
         self._turns.call_soon(wait)
-
-    async def _awaited(self, answer: Awaitable[Any]) -> HealthReport:
-        try:
-            return _report(await answer)
-        except Exception as error:  # noqa: BLE001 - the user's code: reported
-            return self._raised(error)
 
     def _raised(self, error: Exception) -> HealthReport:
         said = f"it raised {type(error).__name__}: {error}"[:_LONGEST]
