@@ -300,7 +300,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in self._found.endpoints.values():
+        for each in tuple(self._found.endpoints.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -328,7 +328,7 @@ class ForeignNode:
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for each in self._found.endpoints.values():
+        for each in tuple(self._found.endpoints.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
         self._watching.drop_services(self._services)

@@ -1,9 +1,8 @@
 """Run the author's callbacks, sync or async, inside rclpy's executor.
 
-An `async def` callback that exceeds its deadline gets
-`DeadlineError` thrown in, so that its traceback shows what it was waiting for. A sync callback
-cannot be interrupted in Python: it is judged when it returns, and a supervisor that lost patience
-ends the process.
+An `async def` callback that exceeds its deadline gets `DeadlineError` thrown in, so that its
+traceback shows what it was waiting for. A sync callback cannot be interrupted in Python: it is
+judged when it returns, and a supervisor that lost patience ends the process.
 """
 
 from __future__ import annotations
