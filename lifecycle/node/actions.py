@@ -1,15 +1,11 @@
 """Action goals of a node: from acceptance through the handler to the result, abort or cancel.
 
-Owns: what a handler's return value or exception makes of its goal; how a goal that can be worked on
-no longer is taken from its handler; and an action's name in the graph.
-
 rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the action, so
 that its name is what is left of theirs. `manifest.names.resolve` is the same without ROS.
 """
 
 from __future__ import annotations
 
-import inspect
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -18,13 +14,14 @@ from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.lifecycle.steps import Running, error_text
+from lifecycle.node.lifecycle.steps import Running, called, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
     from lifecycle.middleware.services.actions import GoalServer
     from lifecycle.node.endpoints.endpoint import Endpoint
+    from lifecycle.node.lifecycle.gate import NodeGate
 
 
 class GoalInterruptedError(LifecycleError):
@@ -36,24 +33,13 @@ class GoalInterruptedError(LifecycleError):
 
 
 class Goals:
-    """The goals of one action server. Closing it ends them all; that is what makes it `Gated`.
-
-    Args:
-        node: whose it is.
-        endpoint: the declared action server; what its handler raises is its `fault`.
-        is_open: the node is active.
-        changed: called when that fault is another one.
-
-    Attributes:
-        server: set by its maker, before it can have a goal.
-    """
+    """The goals of one action server, of which `fault` is what its handler raised last."""
 
     def __init__(
         self,
         node: Node,
         endpoint: Endpoint,
-        *,
-        is_open: Callable[[], bool],
+        gate: NodeGate,
         changed: Callable[[], None],
     ) -> None:
         assert endpoint.handler is not None
@@ -63,23 +49,19 @@ class Goals:
         self._log = node.get_logger()
         self._handler = endpoint.handler
         self._accept = getattr(endpoint.handler, "accept", None)
-        self._is_open = is_open
+        self._gate = gate
         self._changed = changed
         self._runs: dict[bytes, Running] = {}
-        self.server: GoalServer | None = None
+        self.server: GoalServer | None = None  # set by its maker, before it can have a goal
 
-    def open(self) -> None:
-        """Goals arrive by themselves."""
-
-    def close(self) -> None:
-        """End what is left: the node is no longer active."""
-        self.interrupt(f"{self._node} is no longer active")
-
-    def interrupt(self, reason: str) -> None:
+    def end(self) -> None:
         """Take every goal from its handler, and answer those that wait for its result.
 
         A handler that causes this by what it does itself is left alone: it can still return.
         """
+        reason = f"{self._node} is no longer active"
+        if self._gate.is_open:
+            reason = "it was taken off where it was mapped"
         if self.server is None:
             return
         for goal in self.server.goals:
@@ -99,11 +81,9 @@ class Goals:
 
     async def accept(self, goal: Any) -> bool:
         """Decide on a goal: never unless active, and as the author's method says."""
-        if self._is_open() and self._accept is not None:
+        if self._gate.is_open and self._accept is not None:
             try:
-                answer = self._accept(goal)
-                if inspect.isawaitable(answer):
-                    answer = await answer
+                answer = await called(self._accept, goal)
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
                 self._log.error(traceback.format_exc())
                 self._log.error(
@@ -119,25 +99,21 @@ class Goals:
                 return False
             if not answer:
                 return False
-        if not self._is_open():
+        if not self._gate.is_open:
             self._log.warning(f"cannot accept a goal of {self._what}: it is not active")
-        return self._is_open()
+        return self._gate.is_open
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
         """Have the handler work on a goal; returns its result, None for an empty one."""
         if not goal.is_active:
             return None  # interrupted before it began
         key = bytes(goal.goal_id.uuid)
-        run = self._runs[key] = Running(self._handled(goal))
+        run = self._runs[key] = Running(called(self._handler, goal))
         try:
             await run
         finally:
             is_open = self._runs.pop(key, None) is not None
         return self._outcome(goal, run) if is_open else None
-
-    async def _handled(self, goal: ServerGoalHandle) -> Any:
-        returned = self._handler(goal)
-        return await returned if inspect.isawaitable(returned) else returned
 
     def _outcome(self, goal: ServerGoalHandle, run: Running) -> Any | None:
         """Say what is wrong with what a handler did; return the result, None for none."""

@@ -1,11 +1,8 @@
 """The node configuration document: a node's identity, its endpoints as they are, its capabilities.
 
-Owns: collecting a NodeConfiguration (schema: schemas/node_configuration.v1.schema.json) from a live
-node; the transports, wire formats and communication paradigms of each RMW, as far as this package
-can choose them (`connect_to`), which are the input of negotiation; what counts for its checksum, by
-which a reader knows that it must read it again; and one notification for all changes within one
-turn of the executor, none while there is no listener: a configuration costs a millisecond to
-collect.
+Of all changes within one turn of the executor one notification is made, and none while there is no
+listener: a configuration costs a millisecond to collect. Its schema is
+schemas/node_configuration.v1.schema.json.
 
 It is served at `~/get_configuration` and sent to a supervisor. See *Topological Discovery and
 Communication Negotiation*, "Node Configuration Interface".
@@ -19,7 +16,6 @@ import hashlib
 import os
 import threading
 import traceback
-import weakref
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -34,13 +30,13 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
@@ -50,9 +46,10 @@ from lifecycle.node.endpoints.endpoint import (
     Endpoint,
     Placement,
     count_peers,
-    found_endpoint,
+    interface_name,
+    wire_name,
 )
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.plan.negotiation.parties import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -68,6 +65,7 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.manifest.diagnostics import Position
+    from lifecycle.node.host.adoption import Hosted
     from lifecycle.node.lifecycle.gate import Later
 
 
@@ -141,13 +139,7 @@ def checksum(configuration: NodeConfiguration) -> str:
 def connection_reports(
     spec: PlannedNode, connections: Connections, endpoints: Iterable[EndpointReport]
 ) -> tuple[ConnectionReport, ...]:
-    """Return every connection that exists or was asked for, the node's own participant first.
-
-    Args:
-        spec: what the node was planned to be.
-        connections: of the node.
-        endpoints: what it reports of its endpoints.
-    """
+    """Return every connection that exists or was asked for, the node's own participant first."""
     mapped = [each for each in endpoints if each.mapped]
 
     def report(connection: Connection) -> ConnectionReport:
@@ -169,28 +161,20 @@ def connection_reports(
 
 
 def collect(
-    node: Node,
-    spec: PlannedNode,
-    state: HostedState,
-    *,
+    hosted: Hosted,
     endpoints: Iterable[Endpoint],
-    connections: Connections,
     health: HealthReport | None = None,
-    measured: Measured | None = None,
 ) -> NodeConfiguration:
-    """Return the configuration of `node` as it is now.
+    """Return the configuration of a node as it is now.
 
     Args:
-        node: the node itself.
-        spec: what it was planned to be.
-        state: its own.
+        hosted: the node.
         endpoints: all that it has, declared ones that do not exist among them.
-        connections: that it has.
         health: what it says of itself; None if it says nothing.
-        measured: what its subscriptions have counted; None while it is not active.
     """
+    node, state = hosted.node, hosted.reported
     reports = endpoint_reports(node, endpoints)
-    name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
+    name, prefix = hosted.full_name, _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
         identity=Identity(
@@ -206,10 +190,10 @@ def collect(
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=reports,
-        connections=connection_reports(spec, connections, reports),
+        connections=connection_reports(hosted.spec, hosted.connections, reports),
         parameters=parameters.reports(node),
         health=health,
-        measured=measured,
+        measured=hosted.gate.measured(),
     )
     return replace(configuration, checksum=checksum(configuration))
 
@@ -263,7 +247,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         connection=connection.name,
         mapped=True,
     )
-    if endpoint.kind in CLIENTS and placement.watch is not None:
+    if endpoint.kind in CLIENTS and placement.unwatch is not None:
         return replace(report, server_matched=is_server_matched(entity))
     if not endpoint.kind.is_topic:
         return report
@@ -277,7 +261,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
         nfes=_nfes(witness, endpoint.kind, entity, connection),
-        dscp=_dscp(connection),
+        dscp=connection.read_dscp(),
     )
 
 
@@ -292,18 +276,8 @@ def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoin
     return own[0] if len(own) == 1 else None
 
 
-_GID_PREFIXES: weakref.WeakKeyDictionary[Node, str] = weakref.WeakKeyDictionary()
-
-
 def _gid_prefix(node: Node) -> str:
     """Return the participant's part of the node's GIDs in hex; empty if unknown."""
-    known = _GID_PREFIXES.get(node, "") or _read_gid_prefix(node)
-    if known:
-        _GID_PREFIXES[node] = known
-    return known
-
-
-def _read_gid_prefix(node: Node) -> str:
     for name in ("~/transition_event", "/parameter_events"):
         topic = node.resolve_topic_name(name)
         info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
@@ -348,13 +322,6 @@ def _nfes(
     return nfes
 
 
-def _dscp(connection: Connection) -> int | None:
-    try:
-        return connection.read_dscp()
-    except MiddlewareError:
-        return None  # sockets that cannot be read are "not read"
-
-
 def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
     """Return the QoS in force; history and depth, which the graph lacks, as they were asked for."""
     asked = from_rclpy(entity.qos_profile)
@@ -369,46 +336,35 @@ def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
 
 
 class Found:
-    """The endpoints that the code of one node makes by itself, with rclpy's factories.
-
-    Args:
-        at: where the node is declared.
-        changed: called when one is made or destroyed.
-    """
+    """The endpoints that the code of one node makes by itself, by id of their rclpy object."""
 
     def __init__(self, at: Position, changed: Callable[[], None]) -> None:
         self._at = at
         self._changed = changed
-        self._made: dict[int, tuple[EndpointKind, Placement]] = {}
+        self.endpoints: dict[int, Endpoint] = {}
 
-    def add(self, kind: EndpointKind, placement: Placement) -> None:
+    def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
         """Note one that a factory returned."""
-        self._made[id(placement.entity)] = (kind, placement)
+        entity = placement.entity
+        planned = PlannedEndpoint(
+            kind=kind,
+            name="",
+            resolved=wire_name(entity),
+            type=interface_name(interface_of(entity)),
+            qos=None,
+            at=self._at,
+        )
+        endpoint = self.endpoints[id(entity)] = Endpoint(planned=planned, placement=placement)
         self._changed()
+        return endpoint
 
     def remove(self, entity: Any) -> Placement | None:
         """Forget one that is being destroyed, and return where it was; None if it is not known."""
-        _, placement = self._made.pop(id(entity), (None, None))
-        if placement is not None:
-            self._changed()
-        return placement
-
-    @property
-    def endpoints(self) -> tuple[Endpoint, ...]:
-        """Those that exist."""
-        found = []
-        for key, (kind, placement) in tuple(self._made.items()):
-            try:
-                found.append(found_endpoint(kind, placement, self._at))
-            except InvalidHandle:  # noqa: PERF203
-                self._made.pop(key, None)  # destroyed behind its node's back
-        return tuple(found)
-
-    def close(self) -> None:
-        """Watch none of them any more: their node is being destroyed."""
-        for _, placement in self._made.values():
-            if placement.watch is not None:
-                placement.watch.stop()
+        endpoint = self.endpoints.pop(id(entity), None)
+        if endpoint is None:
+            return None
+        self._changed()
+        return endpoint.placement
 
 
 Listener = Callable[["NodeConfiguration"], None]
@@ -420,7 +376,7 @@ class ConfigurationChanges:
     Args:
         later: runs a function in the node's executor.
         collect: returns the configuration as it is now.
-        failed: called with the traceback if it cannot be collected; no listener is notified then.
+        failed: called with the traceback if that raises; no listener is notified then.
     """
 
     def __init__(

@@ -98,7 +98,6 @@ def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecy
         spec=planned,
         domain_id=plan.domain_id,
         arguments=arguments,
-        say=click.echo,
         interrupted=ExitCode.INTERRUPTED,
     )
 

@@ -19,7 +19,7 @@ _SPINNING = {
     ("rclpy.executors", "spin_once"),
     ("rclpy.executors", "spin_once_until_future_complete"),
     ("lifecycle.node.host.loop", "turn"),
-    ("lifecycle.node.host.loop", "_spin_own"),
+    ("lifecycle.node.host.loop", "_spin"),
 }
 """Where a single-threaded executor calls back: rclpy's, and those of our own processes."""
 

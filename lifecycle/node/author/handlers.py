@@ -1,13 +1,12 @@
 """Decorators that tie a method to a declared endpoint, and the matching of the two.
 
-Owns: `@on_message`, `@on_service`, `@on_action`, `@on_goal`, `@on_timer`, and the rule that every
-declared subscription, service server and action server has exactly one handler and every handler
-an endpoint. Pure: knows no rclpy.
+Every declared subscription, service server and action server has exactly one handler, and every
+handler an endpoint. Pure: knows no rclpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import msgspec
@@ -18,11 +17,14 @@ from lifecycle.plan.model import PlannedEndpoint
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+Key = tuple[EndpointKind, str]
+"""Kind and declared name: what identifies an endpoint within its node."""
+
 _ATTRIBUTE = "__lifecycle_handlers__"
-_WORDS = {
-    EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
-    EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
-    EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
+_DECORATORS = {
+    EndpointKind.SUBSCRIPTION: "@on_message",
+    EndpointKind.SERVICE_SERVER: "@on_service",
+    EndpointKind.ACTION_SERVER: "@on_action",
 }
 
 
@@ -49,27 +51,6 @@ class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
     def __call__(self, goal_handle: Any) -> Any:
         """Execute a goal."""
         return self.execute(goal_handle)
-
-
-class Handlers(msgspec.Struct, frozen=True, kw_only=True):
-    """The handlers of one node: (kind, declared name) → method name.
-
-    Attributes:
-        deciders: the methods that decide on goals of actions.
-        timers: (method, period in s) of those to be called while the node is active.
-    """
-
-    methods: Mapping[tuple[EndpointKind, str], str]
-    deciders: Mapping[tuple[EndpointKind, str], str]
-    timers: tuple[tuple[str, float], ...]
-
-    def bound(self, node: object, endpoint: PlannedEndpoint) -> Callable[..., Any]:
-        """Return what handles `endpoint`, a matched one, as methods of `node`."""
-        method: Callable[..., Any] = getattr(node, self.methods[endpoint.kind, endpoint.name])
-        if endpoint.kind is not EndpointKind.ACTION_SERVER:
-            return method
-        decider = self.deciders.get((endpoint.kind, endpoint.name))
-        return ActionHandler(execute=method, accept=getattr(node, decider) if decider else None)
 
 
 def on_message(subscription: str) -> Callable[[F], F]:
@@ -198,60 +179,69 @@ def _marks(node_class: type) -> list[tuple[str, _Mark]]:
 
 def needs_handler(kind: EndpointKind) -> bool:
     """Whether endpoints of a kind give something to a method."""
-    return kind in _WORDS
+    return kind in _DECORATORS
 
 
-def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) -> Handlers:
-    """Pair the decorated methods of `node_class` with the endpoints that need a handler.
+def match(
+    node: object, endpoints: Iterable[PlannedEndpoint], *, name: str
+) -> tuple[dict[Key, Callable[..., Any]], list[tuple[Callable[..., Any], float]]]:
+    """Pair the decorated methods of a node with the endpoints that need a handler.
 
     Args:
-        node_class: a class with decorated methods, its own or inherited.
+        node: of a class with decorated methods, its own or inherited.
         endpoints: every declared endpoint; only the kinds that need a handler are looked at.
-        node: fully qualified node name, for messages.
+        name: of the node, fully qualified, for messages.
+
+    Returns:
+        What handles each endpoint; and what is called each so many seconds.
 
     Raises:
         LifecycleError: with every endpoint without a handler, every handler without an endpoint
             and every endpoint with two, each with the nearest spelling.
     """
-    wanted = [(each.kind, each.name) for each in endpoints if each.kind in _WORDS]
-    methods: dict[tuple[EndpointKind, str], str] = {}
-    deciders: dict[tuple[EndpointKind, str], str] = {}
-    timers: list[tuple[str, float]] = []
-    unused: list[tuple[EndpointKind, str]] = []
+    class_ = type(node).__name__
+    wanted = [(each.kind, each.name) for each in endpoints if needs_handler(each.kind)]
+    methods: dict[Key, str] = {}
+    deciders: dict[Key, str] = {}
+    timers: list[tuple[Callable[..., Any], float]] = []
+    unused: list[Key] = []
     problems: list[str] = []
-    for method, mark in _marks(node_class):
+    for method, mark in _marks(type(node)):
         if mark.kind is None:
-            timers.append((method, mark.period_s))
+            timers.append((getattr(node, method), mark.period_s))
             continue
         key, taken = (mark.kind, mark.name), deciders if mark.decides else methods
-        noun, decorator = _WORDS[mark.kind]
+        noun, decorator = mark.kind.noun, _DECORATORS[mark.kind]
         if key not in wanted:
             decorator = "@on_goal" if mark.decides else decorator
-            declared = [name for kind, name in wanted if kind is mark.kind]
+            declared = [each for kind, each in wanted if kind is mark.kind]
             problems.append(
-                f"cannot use handler {node_class.__name__}.{method}: {decorator}({mark.name!r}) "
-                f"names no {noun} that {node} declares; {alternatives(mark.name, declared)}"
+                f"cannot use handler {class_}.{method}: {decorator}({mark.name!r}) "
+                f"names no {noun} that {name} declares; {alternatives(mark.name, declared)}"
             )
             unused += [] if mark.decides else [key]
         elif key in taken:
             what = f"decide on goals of {noun}" if mark.decides else f"handle {noun}"
             problems.append(
-                f"cannot {what} {mark.name!r} of {node} twice: "
-                f"{node_class.__name__}.{taken[key]} and {node_class.__name__}.{method}"
+                f"cannot {what} {mark.name!r} of {name} twice: "
+                f"{class_}.{taken[key]} and {class_}.{method}"
             )
         else:
             taken[key] = method
-    for kind, name in (each for each in wanted if each not in methods):
-        noun, decorator = _WORDS[kind]
-        near = nearest(name, [other for of, other in unused if of is kind])
+    for kind, each in (key for key in wanted if key not in methods):
+        decorator = _DECORATORS[kind]
+        near = nearest(each, [other for of, other in unused if of is kind])
         hint = f"; did you mean it where {decorator}({near!r}) stands?" if near else ""
         problems.append(
-            f"cannot serve {noun} {name!r} of {node}: no method of {node_class.__name__} is "
-            f"decorated with {decorator}({name!r}){hint}"
+            f"cannot serve {kind.noun} {each!r} of {name}: no method of {class_} is "
+            f"decorated with {decorator}({each!r}){hint}"
         )
     if problems:
         raise LifecycleError("\n".join(problems))
-    return Handlers(methods=methods, deciders=deciders, timers=tuple(timers))
+    handlers = {key: getattr(node, method) for key, method in methods.items()}
+    for key, method in deciders.items():
+        handlers[key] = ActionHandler(execute=handlers[key], accept=getattr(node, method))
+    return handlers, timers
 
 
 def alternatives(name: str, declared: Iterable[str]) -> str:

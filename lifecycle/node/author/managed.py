@@ -1,19 +1,16 @@
-"""The managed half of a LifecycleNode (`node.lifecycle`): machine, gate, data layer, services.
+"""The managed half of a LifecycleNode: machine, gate, data layer, services put together.
 
-Owns: putting them together for one node, and what the rows of the machine's table run. It is
-reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
+It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
 """
 
 from __future__ import annotations
 
-import functools
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
-from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
@@ -21,20 +18,21 @@ from lifecycle.manifest.model import Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.handlers import alternatives, match
-from lifecycle.node.author.spec import Mode
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
+from lifecycle.node.connections.connection_status import ConnectionEvents
 from lifecycle.node.connections.node_interface import acts_of, serve_interface
 from lifecycle.node.endpoints.data_layer import DataLayer
+from lifecycle.node.lifecycle import services
 from lifecycle.node.lifecycle.gate import NodeGate
 from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import (
     Machine,
     NodeState,
     RefusedError,
-    StateChange,
+    Transition,
     TransitionRequest,
 )
-from lifecycle.node.lifecycle.services import LifecycleServices, Turns
+from lifecycle.node.lifecycle.services import Turns
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
@@ -54,11 +52,15 @@ class Managed:
 
     Attributes:
         node: the LifecycleNode.
-        mode: what drives the transitions.
+        full_name: its name, fully qualified.
+        listeners: are called with it after every change of state, whatever caused it.
+        auto: it brings itself up, unless its host says otherwise.
         gate: holds back what the node was made to send, receive and time.
         turns: has things done in its executor.
         spec: what the node was planned to be.
         data_layer: its endpoints.
+        connections: its participants.
+        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories.
     """
@@ -67,7 +69,7 @@ class Managed:
         self,
         node: Node,
         spec: PlannedNode,
-        mode: Mode,
+        auto: bool,
         gate: NodeGate,
         supervisor: str = "",
         *,
@@ -75,45 +77,38 @@ class Managed:
         health: Callable[[], Any] | None = None,
     ) -> None:
         self.node = node
+        self.full_name = str(node.get_fully_qualified_name())
         self.spec = spec
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
-        self.mode = mode
+        self.auto = auto
         self.gate = gate
         self.turns = Turns(node)
-        self._listeners: list[Callable[[Managed], None]] = []
+        self.listeners: list[Callable[[Any], None]] = []
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
-        self._services: LifecycleServices | None = None
+        self._publish: Callable[[Transition], None] = lambda _: None
         self.configuration_changes = ConfigurationChanges(
             self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
         )
         changed = self.configuration_changes.touch
-        self._health = HealthCheck(
-            health,
-            self.turns,
-            spec.health or Health(),
-            changed=changed,
-            failed=node.get_logger().error,
-        )
+        self._health: HealthCheck | None = None
+        if health is not None:
+            how, failed = spec.health or Health(), node.get_logger().error
+            self._health = HealthCheck(health, self.turns, how, changed=changed, failed=failed)
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found = Found(spec.at, changed)
-        self.data_layer = DataLayer(
-            node, spec, gate, self.turns, state=lambda: self.state, changed=changed
-        )
+        self.data_layer = DataLayer(self)
+        self.connections = self.data_layer.connections
+        self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
         self._machine = Machine(self, spec.timeouts)
         if served:
-            self._services = LifecycleServices(node, self._machine, self.turns.group)
+            self._publish = services.serve(node, self._machine, self.turns.group)
             configuration.serve(node, self.get_configuration, self.turns.group)
             serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
             self._join()
-
-    @property
-    def full_name(self) -> str:
-        """Fully qualified node name."""
-        return str(self.node.get_fully_qualified_name())
 
     @property
     def state(self) -> NodeState:
@@ -125,10 +120,6 @@ class Managed:
         """The state, as it is reported to a supervisor."""
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
-
-    def add_listener(self, listener: Callable[[Managed], None]) -> None:
-        """Call `listener(self)` after every change of state, whatever caused it."""
-        self._listeners.append(listener)
 
     async def change(self, request: TransitionRequest | str) -> Result:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
@@ -178,16 +169,10 @@ class Managed:
         """Bring the node up on the first turn of whatever executor spins it."""
 
         async def once() -> None:
-            self.turns.end(timer)
+            end()
             await self.bring_up()
 
-        timer = self.turns.timer(0.0, once)
-
-    def sleep(self, seconds: float) -> Future:
-        """Return what is done in `seconds`, in every state."""
-        future: Future = Future()
-        self.turns.call_after(seconds, lambda: future.set_result(None))
-        return future
+        end = self.turns.call_every(0.0, once)
 
     def close(self) -> None:
         """Leave the graph and take the data layer away: the node is being destroyed."""
@@ -201,34 +186,24 @@ class Managed:
         """Bring the node to finalized from any state; a running async callback is cancelled."""
         return await self._machine.shut_down(reason)
 
-    @property
-    def marks(self) -> tuple[int | None, ...]:
-        """DSCP on the sender sockets of its participants, as it is now."""
-        return self.data_layer.connections.marks
-
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         return configuration.collect(
-            self.node,
-            self.spec,
-            self.reported,
-            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints),
-            connections=self.data_layer.connections,
-            health=self._health.report,
-            measured=self.gate.measured(),
+            self,
+            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
+            health=None if self._health is None else self._health.report,
         )
 
     # What the rows of the machine's table run, beside methods of gate and data layer.
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = match(type(self.node), self.data_layer.unhandled, node=self.full_name)
+        handlers, timed = match(self.node, self.data_layer.unhandled, name=self.full_name)
         parameters.declare(self.node, self.spec)
-        self.data_layer.prepare(functools.partial(matched.bound, self.node))
-        for method, period_s in matched.timers:
-            timer = self.node.create_timer(period_s, getattr(self.node, method))
-            self._method_timers.append(timer)
+        self.data_layer.prepare(handlers)
+        for method, period_s in timed:
+            self._method_timers.append(self.node.create_timer(period_s, method))
 
     def unprepare(self) -> None:
         """Undo `prepare`; parameters stay declared."""
@@ -258,16 +233,23 @@ class Managed:
             except Exception:  # noqa: BLE001, PERF203 - a fault of ours
                 self.node.get_logger().error(traceback.format_exc())
 
-    def changed(self, change: StateChange) -> None:
-        """Notify others of a change of the state."""
-        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
+    def changed(self, state: NodeState, event: Transition | None) -> None:
+        """Notify others of a change of the state.
+
+        Args:
+            state: the new one.
+            event: the edge that other tools are to be shown; None for a change that they do not
+                see.
+        """
+        if self._supervisor and state in _WITHOUT_DATA_LAYER:
             self._let_through = False
-        if change.event is not None and self._services is not None:
-            self._services.publish(change.event)
+        if event is not None:
+            self._publish(event)
         if self._reporter is not None:
-            self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
-        self._health.follow(change.goal)
-        for listener in self._listeners:
+            self._reporter.report(state=state.seen.label, connected=state.connected)
+        if self._health is not None:
+            self._health.follow(state)
+        for listener in self.listeners:
             listener(self)
 
     # What the machine needs for the author's callbacks.

@@ -1,9 +1,7 @@
-"""LifecycleNode: the class to derive from.
+"""LifecycleNode: the class to derive from, as its author sees it.
 
-Owns: the node as its author sees it: how it is constructed, its callbacks, the signatures of
-`declare_…` and of the node interface; and which of rclpy's factories are overridden, so that what
-they make is known and sends and receives only while active. What all of it does is put together in
-managed.py.
+rclpy's factories are overridden, so that what they make is known, and sends and receives only while
+active. What all of it does is put together in managed.py.
 """
 
 from __future__ import annotations
@@ -27,25 +25,23 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.author import parameters
 from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
-    Mode,
+    Construction,
     calling_position,
     default_name,
-    parse_mode,
+    is_auto,
     plan_without_manifest,
-    take_construction,
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
-from lifecycle.node.endpoints.endpoint import EndpointOptions, Placement, interface_name
+from lifecycle.node.endpoints.endpoint import Placement, interface_name
 from lifecycle.node.endpoints.making import resolve_name
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
@@ -97,16 +93,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             def heard(self, message):
                 self.get_logger().info(f"heard {message.data}")
 
-    Without a manifest, the same class declares them itself and drives itself up:
-
-        class Talker(LifecycleNode):
-            def __init__(self):
-                super().__init__("talker", lifecycle="auto")
-                self.declare_publisher("chatter", Int32)
-                self.declare_subscription("echo", Int32)
-            ...
-
-        lifecycle.run(Talker)
+    Without a manifest, it declares them itself, `self.declare_publisher("chatter", Int32)`, and
+    drives itself up, `super().__init__("talker", lifecycle="auto")`.
 
     Callbacks `on_configure`, `on_connect`, `on_activate`, `on_deactivate`, `on_disconnect`,
     `on_cleanup`, `on_shutdown` and `on_error` take `(self, state)` or `(self)`, return SUCCESS,
@@ -140,6 +128,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     lifecycle: Managed
     _gate: NodeGate | None = None
     """None until rclpy has made its own publishers: those are never held back."""
+    _construction: Construction | None = None
+    """Set by the process that hosts it, before rclpy constructs it."""
 
     def __init__(
         self,
@@ -151,41 +141,32 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         enable_communication_interface: bool = True,
         **options: Any,
     ) -> None:
-        mode = parse_mode(lifecycle)
+        auto = is_auto(lifecycle)
         if not isinstance(enable_communication_interface, bool):
             raise TypeError(
                 f"cannot use enable_communication_interface={enable_communication_interface!r}; "
                 "allowed: True, False"
             )
         name = node_name or default_name(type(self))
-        construction = take_construction(name, namespace)
-        planned = construction.spec if construction is not None else None
-        if planned is not None:
-            name, namespace = planned.name, planned.namespace
-            options = parameters.planned_options(planned, options)
-            parameters.give_empty_arrays(self, planned)
-        if construction is not None:
-            context = construction.context or context
-            options.setdefault("use_global_arguments", construction.use_global_arguments)
-            mode = construction.mode or mode
-        supervisor = construction.supervisor if construction is not None else ""
         super().__init__(name, namespace=namespace, context=context, **options)
-        self._gate = NodeGate()
-        spec = planned or plan_without_manifest(
-            type(self), name=self.get_name(), namespace=self.get_namespace()
-        )
+        by_host = self._construction
+        spec = by_host.spec if by_host is not None else None
+        if spec is None:
+            name, namespace = self.get_name(), self.get_namespace()
+            spec = plan_without_manifest(type(self), name=name, namespace=namespace)
+        self._gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         if spec.log_level:
             self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         self.lifecycle = Managed(
             self,
             spec,
-            mode,
+            auto,
             self._gate,
-            supervisor,
+            by_host.supervisor if by_host is not None else "",
             served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
-        if construction is None and mode is Mode.AUTO:
+        if by_host is None and auto:
             self.lifecycle.bring_up_when_spun()
 
     @property
@@ -217,11 +198,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def subscription(self, name: str) -> Subscription:
         """Return rclpy's object of the declared subscription `name`, from on_connect on.
 
-        For `get_publisher_count()` and the like; it is another one after a handover.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-            LifecycleError: the node is not connected.
+        For `get_publisher_count()` and the like; it is another one after a handover. Raises as
+        `client`.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.SUBSCRIPTION, name)
 
@@ -244,7 +222,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         For `async def` callbacks, above all handlers of actions: whatever else the node has to do
         goes on meanwhile, requests to cancel a goal included.
         """
-        return self.lifecycle.sleep(seconds)
+        future: Future = Future()
+        self.lifecycle.turns.call_after(seconds, lambda: future.set_result(None))
+        return future
 
     def undeclare_parameter(self, name: str) -> None:
         """As rclpy's, which notifies nothing; the node's configuration has changed."""
@@ -428,15 +408,14 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             UnknownEndpointError: nothing, or more than one thing, is declared so.
             LifecycleError: its kind cannot have one of them, or it exists already.
         """
-        self.lifecycle.data_layer.set_options(
-            endpoint,
-            EndpointOptions(
-                callback_group=callback_group,
-                event_callbacks=event_callbacks,
-                raw=raw,
-                introspection=introspection,
-            ),
-        )
+        given = {
+            "callback_group": callback_group,
+            "event_callbacks": event_callbacks,
+            "raw": raw,
+            "introspection": introspection,
+        }
+        options = {name: value for name, value in given.items() if value not in (None, False)}
+        self.lifecycle.data_layer.set_options(endpoint, options)
 
     def _declare(
         self,
@@ -547,7 +526,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.data_layer.events.listen(callback)
+        return self.lifecycle.connection_events.listen(callback)
 
     # The factories of rclpy: what they make is gated.
 
@@ -577,7 +556,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
             self._found(EndpointKind.SUBSCRIPTION, subscription)
-            gated = GatedSubscription(subscription, self.lifecycle.turns.call_soon)
+            later = self.lifecycle.turns.call_soon
+            gated = GatedSubscription(subscription, self._gate, later)
             self._gate.add(subscription, gated)
         return subscription
 
@@ -640,7 +620,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         return bool(super().destroy_timer(timer))
 
     def _found(self, kind: EndpointKind, entity: Any) -> None:
-        own = self.lifecycle.data_layer.connections.own
+        own = self.lifecycle.connections.own
         self.lifecycle.found.add(kind, Placement(connection=own, entity=entity))
 
     def _forget(self, entity: object) -> None:

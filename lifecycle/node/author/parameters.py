@@ -1,6 +1,5 @@
 """Parameters of a node: what its interface declares, with the values the plan gives.
 
-Owns: from ParameterDeclaration to rclpy's declared parameters, and what a node reports of them.
 Values come, weakest first, from the interface's default, parameter files, and the manifest's
 `parameters:`. Parameters stay declared through cleanup, so that what an operator set survives into
 the next configure.
@@ -55,8 +54,9 @@ def overrides(spec: PlannedNode) -> list[Parameter]:
     return found
 
 
-def planned_options(spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return keywords of rclpy's Node with the plan's remaps, parameter files and values added."""
+def planned_options(node: Node, spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keywords to construct a node with: the plan's remaps, parameter files and values."""
+    _give_empty_arrays(node, spec)
     return {
         **options,
         "cli_args": [*ros_arguments(spec), *(options.get("cli_args") or ())],
@@ -64,7 +64,7 @@ def planned_options(spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def give_empty_arrays(node: Node, spec: PlannedNode) -> None:
+def _give_empty_arrays(node: Node, spec: PlannedNode) -> None:
     """Have a node that is about to be constructed declare its empty arrays with their type.
 
     Neither rcl's parameter files nor rclpy's overrides and defaults have an empty array of another

@@ -1,99 +1,46 @@
-"""The plan of a node before it is constructed: its PlannedNode, remappings and `module:Class`.
-
-Owns: the construction context through which a host hands a class its part of the plan, so that
-`Camera()` works under the supervisor, alone with a manifest, and alone without one; the plan of a
-node that has no manifest, filled by its own `declare_…` calls; and finding a class by
-`module:Class`, or saying why it cannot be found. Imports no rclpy.
-"""
+"""The plan of a node before it is constructed: its PlannedNode, remappings and `module:Class`."""
 
 from __future__ import annotations
 
-import contextlib
-import contextvars
-import enum
 import importlib
 import importlib.util
 import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import msgspec
 
-from lifecycle.errors import BringUpError, LifecycleError, nearest
+from lifecycle.errors import BringUpError, LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.plan.model import PlannedNode
 
-if TYPE_CHECKING:
-    from rclpy.context import Context
-
-    from lifecycle.node.host.adoption import Adoption
-
-
-class Mode(enum.Enum):
-    """Who drives a node's transitions."""
-
-    MANUAL = "manual"  # driven from outside: a supervisor, `ros2 lifecycle`, launch_ros, nav2
-    AUTO = "auto"  # it configures, connects and activates itself
-
 
 class Construction(msgspec.Struct, frozen=True, kw_only=True):
-    """What a host says to the node that it is about to construct.
+    """What a host says of a node that it is about to construct; it drives the node, too.
 
     Attributes:
         spec: the node's part of the plan; None for a node without a manifest.
-        mode: what drives it; None leaves that to the node's own code. A host that says something
-            also does it: the node does not bring itself up.
-        context: the rclpy context to live in; None for the default one.
-        use_global_arguments: take remaps from the process's own --ros-args.
         supervisor: name of the system whose supervisor alone may activate the node, once its gate
             is open; empty for a node that runs by itself.
     """
 
     spec: PlannedNode | None
-    mode: Mode | None = None
-    context: Context | None = None
-    use_global_arguments: bool = False
     supervisor: str = ""
 
 
-_CURRENT: contextvars.ContextVar[Construction | Adoption | None] = contextvars.ContextVar(
-    "lifecycle_construction", default=None
-)
-
-
-@contextlib.contextmanager
-def constructing(construction: Construction | Adoption) -> Iterator[None]:
-    """Make the next LifecycleNode that is constructed inside the block this one, or these."""
-    token = _CURRENT.set(construction)
-    try:
-        yield
-    finally:
-        _CURRENT.reset(token)
-
-
-def take_construction(name: str, namespace: str | None) -> Construction | None:
-    """Return the pending construction once; a second node made by the first gets None."""
-    construction = _CURRENT.get()
-    if construction is None or not isinstance(construction, Construction):
-        return None if construction is None else construction.take(name, namespace)
-    _CURRENT.set(None)
-    return construction
-
-
-def parse_mode(word: str) -> Mode:
-    """Return the Mode that `lifecycle=` spells.
+def is_auto(word: str) -> bool:
+    """Return whether a node brings itself up, as `lifecycle=` says: "auto", or "manual".
 
     Raises:
-        LifecycleError: neither "manual" nor "auto".
+        LifecycleError: neither of them.
     """
-    try:
-        return Mode(word)
-    except ValueError as error:
-        raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'") from error
+    if word not in ("manual", "auto"):
+        raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'")
+    return word == "auto"
 
 
 def default_name(node_class: type) -> str:
@@ -182,11 +129,10 @@ def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any
         for each, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Node)
     ]
-    near = nearest(name, nodes)
     what = "has no" if found is None else "has, but not as a node class or a function,"
     raise BringUpError(
         f"cannot use {reference!r}: {module_name} {what} {name!r}",
-        hint=f"did you mean {near!r}?" if near else f"node classes there: {nodes or 'none'}",
+        hint=did_you_mean(name, nodes) or f"node classes there: {nodes or 'none'}",
     )
 
 

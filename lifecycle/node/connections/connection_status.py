@@ -1,26 +1,23 @@
-"""Status of connections and mappings: which have peers, which are established, and its events.
+"""Events of connections and mappings: what is different in two configurations of a node.
 
-Owns: the rules by which a connection counts as established or lost, every connection event and its
-type, and which listener is called when: in the node's executor, in order, after the callback in
-which it happened. See *Topological Discovery and Communication Negotiation*, "Node Interface"
-(introspection by notification).
+See *Topological Discovery and Communication Negotiation*, "Node Interface" (introspection by
+notification).
 """
 
 from __future__ import annotations
 
-import collections
 import enum
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from lifecycle.node.connections.connections import Connection
-from lifecycle.node.endpoints.endpoint import Endpoint, Key, count_peers
+from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
+    from lifecycle.node.configuration import ConfigurationChanges
     from lifecycle.node.lifecycle.gate import Later
 
 
@@ -58,26 +55,69 @@ class ConnectionEvent(msgspec.Struct, frozen=True, kw_only=True):
     unmade: bool = False
 
 
+def events_between(
+    before: NodeConfiguration, after: NodeConfiguration
+) -> Iterator[ConnectionEvent]:
+    """Yield what became of connections and mappings.
+
+    What is mapped onto a connection and has no peer yet is no loss of it.
+    """
+    old = {each.name: each for each in before.connections if not each.error}
+    new = {each.name: each for each in after.connections if not each.error}
+    kinds = ConnectionEventKind
+
+    def event(kind: ConnectionEventKind, name: str, **fields: Any) -> ConnectionEvent:
+        urls = (old | new)[name].urls
+        return ConnectionEvent(kind=kind, connection=name, urls=urls, **fields)
+
+    for name in (each for each in new if each not in old):
+        yield event(kinds.CONNECTION_ESTABLISHED, name)
+    were, are = _mappings(before), _mappings(after)
+    for endpoint, name in (each for each in were if each not in are):
+        yield event(kinds.MAPPING_LOST, name, endpoint=endpoint, unmade=True)
+    losing = set()
+    for (endpoint, name), peers in are.items():
+        more = (peers or 0) - (were.get((endpoint, name)) or 0)
+        if more < 0:
+            losing.add(name)
+            yield event(kinds.MAPPING_LOST, name, endpoint=endpoint, peers=peers)
+        elif more > 0 or (endpoint, name) not in were:
+            yield event(kinds.MAPPING_ESTABLISHED, name, endpoint=endpoint, peers=peers)
+    for name in (each for each in new if each in old):
+        if new[name].established and not old[name].established:
+            yield event(kinds.CONNECTION_ESTABLISHED, name)
+        elif old[name].established and not new[name].established and name in losing:
+            yield event(kinds.CONNECTION_LOST, name)
+    for name in (each for each in old if each not in new):
+        yield event(kinds.CONNECTION_LOST, name, unmade=True)
+
+
+def _mappings(configuration: NodeConfiguration) -> dict[tuple[str, str], int | None]:
+    """Return the peers of each declared endpoint that is mapped, by its spelling and connection."""
+    return {
+        (each.kind.spell(each.name), each.connection): each.matched
+        for each in configuration.endpoints
+        if each.mapped and each.name
+    }
+
+
 Listener = Callable[[ConnectionEvent], Any]
 
 
 class ConnectionEvents:
-    """What becomes of one node's connections and mappings, and who is called then.
+    """Who is called when something becomes of one node's connections and mappings."""
 
-    Args:
-        later: runs a function, sync or async, in the node's executor.
-        endpoints: every declared endpoint, as it is at any time.
-    """
-
-    def __init__(self, later: Later, endpoints: Mapping[Key, Endpoint]) -> None:
+    def __init__(self, changes: ConfigurationChanges, later: Later) -> None:
+        self._changes = changes
         self._later = later
-        self._endpoints = endpoints
         self._listeners: dict[object, Listener] = {}
-        self._waiting: collections.deque[ConnectionEvent] = collections.deque()
-        self._established: set[str] = set()
+        self._before: NodeConfiguration | None = None
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener`, sync or async, with each event from now on; returns what ends that."""
+        if self._before is None:
+            self._before = self._changes.collect()
+            self._changes.listen(self._look)
         key = object()
         self._listeners[key] = listener
 
@@ -86,97 +126,11 @@ class ConnectionEvents:
 
         return remove
 
-    def notify(self, event: ConnectionEvent) -> None:
-        """Have the listeners called soon."""
-        if self._listeners:
-            self._waiting.append(event)  # rclpy's executor runs the newest task first
-            self._later(self._deliver)
-
-    def _deliver(self) -> None:
-        while self._waiting:
-            event = self._waiting.popleft()
+    def _look(self, after: NodeConfiguration) -> None:
+        before, self._before = self._before, after
+        for event in events_between(before, after) if before is not None else ():
             for listener in tuple(self._listeners.values()):
                 if inspect.iscoroutinefunction(listener):
                     self._later(functools.partial(listener, event))
                 else:
                     listener(event)
-
-    def opened(self, connection: Connection) -> None:
-        """A connection was made, or is there already."""
-        self._judge(connection, lost=False)
-
-    def closed(self, connection: Connection) -> None:
-        """A connection with a name was removed."""
-        self._established.discard(connection.name)
-        self._report(ConnectionEventKind.CONNECTION_LOST, connection, unmade=True)
-
-    def mapped(self, endpoint: Endpoint) -> None:
-        """An endpoint was mapped."""
-        assert endpoint.connection is not None
-        self._count(endpoint)
-        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, endpoint.connection, endpoint)
-        self._judge(endpoint.connection, lost=False)
-
-    def unmapped(self, endpoint: Endpoint, connection: Connection) -> None:
-        """An endpoint was taken off a connection."""
-        self._report(ConnectionEventKind.MAPPING_LOST, connection, endpoint, unmade=True)
-
-    def matched(self, endpoint: Endpoint) -> None:
-        """Count the peers of a mapping again, and notify if they are more or fewer."""
-        before = endpoint.peers or 0
-        self._count(endpoint)
-        now, connection = endpoint.peers or 0, endpoint.connection
-        if connection is None or now == before:
-            return
-        kind = ConnectionEventKind.MAPPING_ESTABLISHED
-        if now < before:
-            kind = ConnectionEventKind.MAPPING_LOST
-        self._report(kind, connection, endpoint)
-        self._judge(connection, lost=now < before)
-
-    def _count(self, endpoint: Endpoint) -> None:
-        if endpoint.kind.is_topic and endpoint.placement is not None:
-            endpoint.peers = count_peers(endpoint.placement.entity)
-
-    def _report(
-        self,
-        kind: ConnectionEventKind,
-        connection: Connection,
-        endpoint: Endpoint | None = None,
-        *,
-        unmade: bool = False,
-    ) -> None:
-        self.notify(
-            ConnectionEvent(
-                kind=kind,
-                connection=connection.name,
-                urls=connection.urls,
-                endpoint="" if endpoint is None else endpoint.spelling,
-                peers=None if endpoint is None or unmade else endpoint.peers,
-                unmade=unmade,
-            )
-        )
-
-    def _judge(self, connection: Connection, *, lost: bool) -> None:
-        """Notify that a connection is established, or no longer.
-
-        What is mapped onto it and has no peer yet is no loss, and is not reported. The node's own
-        participant is no connection before something is mapped onto it.
-        """
-        on = [
-            each
-            for each in self._endpoints.values()
-            if each.connection is not None and each.connection.name == connection.name
-        ]
-        established = bool(connection.name or on) and all(
-            each.peers for each in on if each.kind.is_topic
-        )
-        if established == (connection.name in self._established):
-            return
-        if established:
-            self._established.add(connection.name)
-            self._report(ConnectionEventKind.CONNECTION_ESTABLISHED, connection)
-        else:
-            self._established.discard(connection.name)
-            if lost:
-                self._report(ConnectionEventKind.CONNECTION_LOST, connection)

@@ -1,8 +1,7 @@
 """The connections of one node: extra participants that its endpoints can be mapped onto.
 
-Owns: making and destroying participants beside the node's own, their names, and having their
-callbacks run where the node's own run. `connect_to` of *Topological Discovery and Communication
-Negotiation*; which endpoint is on which connection is data_layer.py's.
+`connect_to` of *Topological Discovery and Communication Negotiation*; which endpoint is on which
+connection is data_layer.py's.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -65,15 +64,26 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
         return None if self.participant is None else self.participant.node
 
     def read_dscp(self) -> int | None:
-        """Return the DSCP on the participant's sender sockets, 0–63; None for the node's own."""
-        return None if self.participant is None else self.participant.read_dscp()
+        """Return the DSCP on its sender sockets, 0–63; None where that is not known."""
+        if self.participant is None:
+            return None
+        try:
+            return self.participant.read_dscp()
+        except MiddlewareError:
+            return None
 
 
 class Connections:
-    """All connections of one node; its own participant is always one of them."""
+    """All connections of one node; its own participant is always one of them.
 
-    def __init__(self, node: Node) -> None:
+    Args:
+        node: whose they are.
+        planned: the participants that it may get beside its own.
+    """
+
+    def __init__(self, node: Node, planned: Iterable[PlannedParticipant]) -> None:
         self._node = node
+        self._planned = {each.name: each for each in planned}
         self.own = Connection(name="", has_shared_memory=has_shared_memory(node))
         self._made: dict[str, Connection] = {}  # by name of the hidden node
         self._failed: dict[str, Connection] = {}  # by name
@@ -86,11 +96,6 @@ class Connections:
         return tuple(each for each in self._made.values() if each.name)
 
     @property
-    def unnamed(self) -> tuple[Connection, ...]:
-        """Those that only give a publisher its own flow."""
-        return tuple(each for each in self._made.values() if not each.name)
-
-    @property
     def failed(self) -> tuple[Connection, ...]:
         """Those that were asked for and could not be made."""
         return tuple(self._failed.values())
@@ -98,13 +103,7 @@ class Connections:
     @property
     def marks(self) -> tuple[int | None, ...]:
         """DSCP on the sender sockets of each participant, as it is now; None: cannot be read."""
-        found: list[int | None] = []
-        for each in tuple(self._made.values()):
-            try:
-                found.append(each.read_dscp())
-            except MiddlewareError:  # noqa: PERF203 - "not read" is what is known then
-                found.append(None)
-        return tuple(found)
+        return tuple(each.read_dscp() for each in tuple(self._made.values()))
 
     def find(self, connection: Connection | str) -> Connection:
         """Return the connection that is meant; the empty name is the node's own participant.
@@ -132,15 +131,12 @@ class Connections:
             number += 1
         return f"connection_{number}"
 
-    def connect_to(
-        self, name: str, how: ParticipantConnections, planned: PlannedParticipant | None
-    ) -> Connection:
+    def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make the participant of a named connection; one that exists so already is returned.
 
         Args:
             name: letters, digits and underscores.
-            how: at least one URL.
-            planned: what the plan says of a connection of that name, beside its URLs.
+            how: at least one URL; the plan says more of a connection that it knows by this name.
 
         Raises:
             ConnectError: not a name, a URL that is none, a name in use for other URLs, or the
@@ -162,6 +158,7 @@ class Connections:
                 f"{what} ({', '.join(how.urls)}): it is connected to {', '.join(found.urls)}",
                 hint="disconnect it first, or choose another name",
             )
+        planned = next((each for each in self._planned.values() if each.connection == name), None)
         try:
             return self._make(name, how, planned or self._unplanned(name))
         except LifecycleError as error:
@@ -169,16 +166,25 @@ class Connections:
             self._failed[name] = Connection(name=name, urls=how.urls, error=message)
             raise ConnectError(message, hint=error.hint) from error
 
-    def carrier(self, planned: PlannedParticipant) -> Connection:
-        """Return the connection on a participant that the plan has; make it at first use.
+    def planned(self, name: str) -> Connection:
+        """Return the connection on a participant of the plan, made at first use.
+
+        Args:
+            name: of the participant; one that the plan has not is the node's own.
 
         Raises:
             LifecycleError: it could not be made.
         """
+        planned = self._planned.get(name)
+        if planned is None:
+            return self.own
         if planned.connection:
-            return self.connect_to(planned.connection, planned.connections, planned)
-        made = self._made.get(planned.name)
-        return made or self._make("", planned.connections, planned)
+            return self.connect_to(planned.connection, planned.connections)
+        return self._made.get(name) or self._make("", planned.connections, planned)
+
+    def is_named(self, name: str) -> bool:
+        """Whether a participant of the plan is a connection with a name."""
+        return name in self._planned and bool(self._planned[name].connection)
 
     def close(self, connection: Connection) -> None:
         """Unmake a connection that nothing is mapped onto any more."""
@@ -186,6 +192,12 @@ class Connections:
         participant, connection.participant = connection.participant, None
         if participant is not None:
             participant.destroy()
+
+    def close_unused(self, used: Collection[Connection | None]) -> None:
+        """Unmake participants of single flows that carry nothing any more."""
+        for each in tuple(self._made.values()):
+            if not each.name and each not in used:
+                self.close(each)
 
     def forget(self, name: str) -> bool:
         """Forget a connection that could not be made; returns whether there was one."""

@@ -88,25 +88,23 @@ def _serving(
 
 
 def _text(parameter: Parameter, what: str) -> str:
-    value: ParameterValue = parameter.value
-    if value.type != ParameterType.PARAMETER_STRING:
-        raise LifecycleError(
-            f"cannot use the value given for {parameter.name!r}: {what} is a string, type "
-            f"{ParameterType.PARAMETER_STRING}, not type {value.type}",
-            hint="write {type: 4, string_value: '…'}",
-        )
-    return str(value.string_value)
+    (text,) = _texts(parameter, what, several=False)
+    return text
 
 
-def _texts(parameter: Parameter, what: str) -> Sequence[str]:
+def _texts(parameter: Parameter, what: str, *, several: bool = True) -> Sequence[str]:
     value: ParameterValue = parameter.value
-    if value.type == ParameterType.PARAMETER_STRING:
+    one, many = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_STRING_ARRAY
+    if value.type == one:
         return (str(value.string_value),)
-    if value.type == ParameterType.PARAMETER_STRING_ARRAY:
+    if several and value.type == many:
         return tuple(value.string_array_value)
+    wanted, hint = f"a string, type {one}", "write {type: 4, string_value: '…'}"
+    if several:
+        wanted = f"a string or an array of strings, type {one} or {many}"
+        hint += " or {type: 9, string_array_value: ['…']}"
     raise LifecycleError(
-        f"cannot use the value given for {parameter.name!r}: {what} is a string or an array of "
-        f"strings, type {ParameterType.PARAMETER_STRING} or {ParameterType.PARAMETER_STRING_ARRAY},"
-        f" not type {value.type}",
-        hint="write {type: 4, string_value: '…'} or {type: 9, string_array_value: ['…']}",
+        f"cannot use the value given for {parameter.name!r}: {what} is {wanted}, not type "
+        f"{value.type}",
+        hint=hint,
     )

@@ -1,10 +1,7 @@
 """The data layer of a node: what it declares, and which connection each of it is mapped onto.
 
-Owns: the endpoints by kind and name, as the node's manifest or plan and its own code declare them,
-taken together; the order in which connections and endpoints are made and removed; `connect_to`,
-`map_to`, `disconnect` and `remap`, in which states they are allowed, and that a strictly unique
-flow is not shared: one implementation behind the local API, the ROS services (node_interface.py)
-and the control channel.
+One implementation behind the local API, the ROS services (node_interface.py) and the control
+channel.
 
 *configure* imports what is declared, *connect* maps what is not mapped yet onto the connection
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
@@ -14,11 +11,10 @@ Negotiation*, "Node Interface".
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
@@ -26,29 +22,26 @@ from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.node.author.handlers import alternatives, needs_handler
-from lifecycle.node.connections.connection_status import ConnectionEvents
+from lifecycle.node.author.handlers import Key, alternatives, needs_handler
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.endpoint import (
     CLIENTS,
     Endpoint,
-    EndpointOptions,
-    Key,
-    MatchWatch,
     Placement,
     UnknownEndpointError,
-    Watch,
+    count_peers,
     find_endpoint,
+    refuse_unfit,
+    watch_matches,
 )
-from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
+from lifecycle.node.endpoints.handover import Handover
 from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
-    from lifecycle.node.lifecycle.gate import NodeGate
-    from lifecycle.node.lifecycle.services import Turns
+    from lifecycle.node.author.managed import Managed
 
 _CONFIGURED = frozenset(
     {
@@ -83,43 +76,26 @@ class DataLayer:
     """Declared endpoints of one node and their mapping onto connections.
 
     Args:
-        node: whose endpoints these are.
-        spec: what it was planned to be.
-        gate: holds back its publishers and subscriptions.
-        turns: of the node's executor.
-        state: of the node, now.
-        changed: called when the node configuration has changed, match counts included.
+        managed: the node; its gate holds back publishers and subscriptions.
 
     Attributes:
         endpoints: from configure to cleanup every declared endpoint, in the order of declaration.
         connections: what endpoints may be mapped onto.
-        events: what becomes of connections and mappings.
         is_made: connect has made all of it, or found it made by the authority.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        spec: PlannedNode,
-        gate: NodeGate,
-        turns: Turns,
-        *,
-        state: Callable[[], NodeState],
-        changed: Callable[[], None],
-    ) -> None:
-        self._node = node
-        self._name = node.get_fully_qualified_name()
-        self._spec = spec
-        self._gate = gate
-        self._turns = turns
-        self._state = state
-        self._changed = changed
-        self._maker = Maker(node, gate, turns, changed)
+    def __init__(self, managed: Managed) -> None:
+        self._managed = managed
+        self._node = managed.node
+        self._name = managed.full_name
+        spec = self._spec = managed.spec
+        self._gate = managed.gate
+        self._turns = managed.turns
+        self._changed = managed.configuration_changes.touch
+        self._maker = Maker(managed)
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
-        self._handovers: dict[Key, tuple[Handover, Placement]] = {}
         self.endpoints: dict[Key, Endpoint] = {}
-        self.connections = Connections(node)
-        self.events = ConnectionEvents(turns.call_soon, self.endpoints)
+        self.connections = Connections(self._node, spec.participants)
         self.is_made = False
 
     # What is declared.
@@ -138,7 +114,7 @@ class DataLayer:
             LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
                 declared already, it needs a handler, or it cannot be made.
         """
-        is_early = self._state() is NodeState.UNCONFIGURED
+        is_early = self._managed.state is NodeState.UNCONFIGURED
         if not is_early:
             self._refuse_late(planned)
         endpoint = self._declared.get((planned.kind, planned.name))
@@ -154,7 +130,7 @@ class DataLayer:
         return endpoint
 
     def _refuse_late(self, planned: PlannedEndpoint) -> None:
-        state = self._state()
+        state = self._managed.state
         what = (
             f"cannot declare {planned.kind.noun} {planned.name!r} while {self._name} is "
             f"{state.value!r}"
@@ -183,7 +159,7 @@ class DataLayer:
         if not self.is_made or self._is_mapped_by_others:
             return
         try:
-            self._map(endpoint, self._default(endpoint))
+            self._map(endpoint, self.connections.planned(endpoint.planned.participant))
         except BaseException:
             self._forget(endpoint)
             raise
@@ -194,7 +170,7 @@ class DataLayer:
         endpoint.size_bytes = endpoint.size_bytes if size_bytes is None else size_bytes
         self._changed()
 
-    def set_options(self, spelling: str, options: EndpointOptions) -> None:
+    def set_options(self, spelling: str, options: dict[str, Any]) -> None:
         """Keep how an endpoint is to be made.
 
         Raises:
@@ -202,7 +178,7 @@ class DataLayer:
             LifecycleError: it exists already, or its kind cannot have them.
         """
         endpoint = self.find(spelling)
-        options.refuse_unfit(endpoint.kind)
+        refuse_unfit(endpoint.kind, options)
         if endpoint.placement is not None:
             raise LifecycleError(
                 f"cannot set options of {endpoint.spelling} of {self._name}: it exists already",
@@ -211,17 +187,13 @@ class DataLayer:
         endpoint.options = options
 
     def find(self, spelling: str) -> Endpoint:
-        """Return the endpoint `video`, `publishers/video`, or `publishers//robot/video` in full.
+        """Return the endpoint `video`, or `publishers/video`.
 
         Raises:
             UnknownEndpointError: none, or more than one, is called so.
         """
-        declared = self.endpoints
-        if self._state() is NodeState.UNCONFIGURED:
-            declared = self._declared
-        on_wire = {each.kind.spell(each.wire_name): each for each in self.endpoints.values()}
-        if spelling in on_wire and spelling not in {e.spelling for e in self.endpoints.values()}:
-            return on_wire[spelling]
+        is_early = self._managed.state is NodeState.UNCONFIGURED
+        declared = self._declared if is_early else self.endpoints
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
     def publisher(self, name: str) -> DeclaredPublisher:
@@ -266,23 +238,20 @@ class DataLayer:
         """What is declared without a handler in code."""
         return tuple(e.planned for e in self._declared.values() if e.callback is None)
 
-    def prepare(self, bound: Callable[[PlannedEndpoint], Callable[..., Any]]) -> None:
+    def prepare(self, handlers: Mapping[Key, Callable[..., Any]]) -> None:
         """Import every type and make the publishers' handles; no endpoint exists yet.
 
         Args:
-            bound: returns the decorated method of one that has no handler in code.
+            handlers: decorated methods, of what has no handler in code.
 
         Raises:
             LifecycleError: types that are not installed, all of them at once.
         """
         problems: list[str] = []
         for endpoint in self._declared.values():
-            handler = endpoint.callback
-            if handler is None and needs_handler(endpoint.kind):
-                handler = bound(endpoint.planned)
             try:
-                self._prepare(endpoint, handler)
-            except LifecycleError as error:
+                self._prepare(endpoint, endpoint.callback or handlers.get(endpoint.key))
+            except LifecycleError as error:  # noqa: PERF203 - all of them are said
                 problems.append(str(error))
         if problems:
             self.unprepare()
@@ -347,8 +316,6 @@ class DataLayer:
             self._unmap(endpoint)
             if endpoint.handle is not None:
                 endpoint.handle.forget()
-        for connection in reversed(self.connections.named):
-            self._close(connection)
         self.connections.close_all()
         self.is_made = False
         self._changed()
@@ -364,33 +331,23 @@ class DataLayer:
         try:
             for planned in self._spec.participants:
                 if planned.connection:
-                    self.events.opened(self.connections.carrier(planned))
+                    self.connections.planned(planned.name)
             for current in self.endpoints.values():
                 if current.placement is None:
-                    self._map(current, self._default(current))
+                    self._map(current, self.connections.planned(current.planned.participant))
         except Exception as error:
             for each in reversed(self.endpoints.values()):
                 if each not in before:
                     self._unmap(each)
             for connection in self.connections.named:
                 if connection not in connected_before:
-                    self._close(connection)
+                    self.connections.close(connection)
             if current is None:
                 raise ConnectError(str(error)) from error
             current.error = str(error)
             raise ConnectError(
                 f"cannot connect {current.kind.noun} {current.name!r} of {self._name}: {error}"
             ) from error
-
-    def _default(self, endpoint: Endpoint) -> Connection:
-        """Return the connection that the plan says; make its participant at first use."""
-        name = endpoint.planned.participant
-        if not name:
-            return self.connections.own
-        for each in self._spec.participants:
-            if each.name == name:
-                return self.connections.carrier(each)
-        raise ConnectError(f"cannot find participant {name!r} in the plan of {self._name}")
 
     def _refuse_unmapped(self) -> None:
         missing = [each.spelling for each in self.endpoints.values() if each.placement is None]
@@ -403,10 +360,6 @@ class DataLayer:
                 hint=f"call {self._name}/map_to for each, or write data_layer.authority: nodes",
             )
 
-    def _close(self, connection: Connection) -> None:
-        self.connections.close(connection)
-        self.events.closed(connection)
-
     # The node interface.
 
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
@@ -414,13 +367,10 @@ class DataLayer:
         where = ", ".join(how.urls) or repr(name)
         self._refuse_unconfigured(f"connect {self._name} to {where}")
         name = name or self.connections.free_name()
-        planned = next((each for each in self._spec.participants if each.connection == name), None)
         try:
-            connection = self.connections.connect_to(name, how, planned)
+            return self.connections.connect_to(name, how)
         finally:
             self._changed()
-        self.events.opened(connection)
-        return connection
 
     def map_to(self, spelling: str, connection: Connection | str) -> Future:
         """Map an endpoint, or hand it over from where it is: LifecycleNode.map_to.
@@ -432,8 +382,9 @@ class DataLayer:
         endpoint = self.find(spelling)
         target = self.connections.find(connection)
         try:
-            if target is self.connections.own and not self._is_on_named(endpoint.planned):
-                target = self._default(endpoint)
+            planned = endpoint.planned.participant
+            if target is self.connections.own and not self.connections.is_named(planned):
+                target = self.connections.planned(planned)
             return self._move(endpoint, target)
         except LifecycleError as error:
             message = (
@@ -461,12 +412,12 @@ class DataLayer:
                 hint="map its endpoints onto another connection, or take transition 'disconnect'",
             )
         for endpoint in self.endpoints.values():
-            running = self._handovers.get(endpoint.key)
-            if running is not None and found in (running[1].connection, endpoint.connection):
-                running[0].end()
+            handover = endpoint.handover
+            if handover is not None and found in (handover.old.connection, endpoint.connection):
+                handover.end()
             if endpoint.connection is found:
                 self._unmap(endpoint)
-        self._close(found)
+        self.connections.close(found)
         self._changed()
 
     def remap(self, spelling: str, name: str) -> None:
@@ -477,7 +428,8 @@ class DataLayer:
         expanded = self._maker.expand(endpoint, name) if name else ""
         if expanded == before:
             return
-        self._end_handover(endpoint)
+        if endpoint.handover is not None:
+            endpoint.handover.end()
         endpoint.given_name = expanded
         old = endpoint.placement
         if old is not None:
@@ -487,21 +439,15 @@ class DataLayer:
                 endpoint.given_name = before
                 raise
             self._take_over(endpoint, old)
-            self.events.mapped(endpoint)
         self._changed()
 
     def _refuse_unconfigured(self, what: str) -> None:
-        state = self._state()
+        state = self._managed.state
         if state not in _CONFIGURED:
             raise NotConfiguredError(
                 f"cannot {what}: it is {state.value!r}",
                 hint="endpoints are declared from configure until cleanup; configure it first",
             )
-
-    def _is_on_named(self, planned: PlannedEndpoint) -> bool:
-        """Whether the plan has an endpoint on a connection with a name."""
-        named = {each.name for each in self._spec.participants if each.connection}
-        return planned.participant in named
 
     # Single endpoints.
 
@@ -510,59 +456,56 @@ class DataLayer:
         endpoint.placement = self._place(endpoint, connection)
         if endpoint.handle is not None:
             endpoint.handle.attach(endpoint.entity)
-        self.events.mapped(endpoint)
         self._changed()
 
     def _unmap(self, endpoint: Endpoint) -> None:
         """Take an endpoint off where it is; harmless if it is nowhere."""
-        self._end_handover(endpoint)
+        if endpoint.handover is not None:
+            endpoint.handover.end()
         placement = endpoint.placement
         if placement is None:
             return
         if endpoint.handle is not None:
             endpoint.handle.detach()
-        endpoint.placement = endpoint.peers = None
+        endpoint.placement = None
         self._unplace(endpoint, placement)
 
     def _move(self, endpoint: Endpoint, connection: Connection) -> Future:
         """Map an endpoint onto another connection, make before break; raises LifecycleError."""
-        running = self._handovers.get(endpoint.key)
-        if endpoint.connection is connection:
-            return running[0].done if running is not None else nothing_to_hand_over()
-        self._end_handover(endpoint)
-        if endpoint.placement is not None:
-            return self._hand_over(endpoint, endpoint.placement, connection)
-        self._map(endpoint, connection)
-        endpoint.error = ""
-        return nothing_to_hand_over()
+        if endpoint.connection is not connection:
+            if endpoint.handover is not None:
+                endpoint.handover.end()
+            if endpoint.placement is None:
+                self._map(endpoint, connection)
+            else:
+                return self._hand_over(endpoint, endpoint.placement, connection)
+            endpoint.error = ""
+        elif endpoint.handover is not None:
+            return endpoint.handover.done
+        done: Future = Future()
+        done.set_result(None)
+        return done
 
     def _hand_over(self, endpoint: Endpoint, old: Placement, connection: Connection) -> Future:
         """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
-        peers = endpoint.peers
+        peers = _peers(endpoint)
         endpoint.placement = self._place(endpoint, connection)
         endpoint.error = ""
 
         def finish() -> None:
-            del self._handovers[endpoint.key]
+            endpoint.handover = None
             self._take_over(endpoint, old)
             self._tidy()
             self._changed()
 
         # Two servers would both answer; and a client's answers may still be under way.
-        lives_on = bool(peers) if endpoint.kind.is_topic else endpoint.kind in CLIENTS
-        handover = Handover(peers_before=peers or 1, after=self._turns.call_after, finish=finish)
-        self._handovers[endpoint.key] = (handover, old)
-        self.events.mapped(endpoint)
+        lives_on = peers > 0 if endpoint.kind.is_topic else endpoint.kind in CLIENTS
+        handover = endpoint.handover = Handover(old, peers or 1, self._turns, finish)
         if not lives_on or self._node.executor is None:
             handover.end()
         else:
-            handover.peers_changed(endpoint.peers or 0)
+            handover.peers_changed(_peers(endpoint))
         return handover.done
-
-    def _end_handover(self, endpoint: Endpoint) -> None:
-        running = self._handovers.get(endpoint.key)
-        if running is not None:
-            running[0].end()
 
     def _take_over(self, endpoint: Endpoint, old: Placement) -> None:
         """Let the new one do what the old one did until now, which is destroyed."""
@@ -577,36 +520,30 @@ class DataLayer:
         """Make an endpoint on a connection; where it is now is left alone."""
         self._refuse_shared_flow(endpoint, connection)
         entity = self._maker.make(endpoint, connection)
-        watch: Watch | None = None
+        unwatch: Callable[[], None] | None = None
         if endpoint.kind.is_topic:
-            watch = MatchWatch(
+            unwatch = watch_matches(
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            watch = ServerWatch(connection.node or self._node, entity, self._changed)
-        return Placement(connection=connection, entity=entity, watch=watch)
+            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
+        return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
-        if placement.watch is not None:
-            placement.watch.stop()
-        self._maker.unmake(endpoint, placement.entity, placement.connection)
-        self.events.unmapped(endpoint, placement.connection)
+        if placement.unwatch is not None:
+            placement.unwatch()
+        self._maker.unmake(endpoint.kind, placement.entity, placement.connection)
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""
-        self.events.matched(endpoint)
-        running = self._handovers.get(endpoint.key)
-        if running is not None:
-            running[0].peers_changed(endpoint.peers or 0)
+        if endpoint.handover is not None:
+            endpoint.handover.peers_changed(_peers(endpoint))
         self._changed()  # as many peers as before may be others
 
     def _tidy(self) -> None:
-        """Unmake participants of single flows that carry nothing any more."""
         used = [each.connection for each in self.endpoints.values()]
-        used += [old.connection for _, old in self._handovers.values()]
-        for connection in self.connections.unnamed:
-            if connection not in used:
-                self.connections.close(connection)
+        used += [each.handover.old.connection for each in self.endpoints.values() if each.handover]
+        self.connections.close_unused(used)
 
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets.
@@ -627,6 +564,11 @@ class DataLayer:
                         f"(strictly_required), and would share it with publisher {two.name!r}",
                         hint="give each a connection of its own",
                     )
+
+
+def _peers(endpoint: Endpoint) -> int:
+    """Return how many peers an endpoint has where it is now; 0 of what has no count."""
+    return count_peers(endpoint.entity) if endpoint.kind.is_topic and endpoint.placement else 0
 
 
 def _refuse_other(planned: PlannedEndpoint, before: PlannedEndpoint) -> None:

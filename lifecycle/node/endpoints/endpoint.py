@@ -1,15 +1,13 @@
 """One endpoint of a node: what it is, how code wants it made, and where it is now.
 
-Owns: `Endpoint`; the meaning of a spelling in requests and messages (`video`, or
-`publishers/video`), and the error when it names nothing or too much; rclpy's matched events on our
-executor. Such an event is handled in a group of the framework's: an author's callback that awaits
+rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rclpy.event_handler import (
@@ -21,23 +19,19 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError, nearest
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.rcl.rclpy_nodes import interface_of
+from lifecycle.node.author.handlers import Key
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.node import Node
-    from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
+    from lifecycle.node.endpoints.handover import Handover
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
-
-Key = tuple[EndpointKind, str]
-"""Kind and declared name: what identifies an endpoint within its node."""
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 
@@ -103,70 +97,51 @@ def count_peers(entity: Publisher | Subscription) -> int:
     return int(entity.get_publisher_count())
 
 
-class MatchWatch:
-    """Calls back each time that peers of an endpoint were matched or unmatched.
+def watch_matches(
+    node: Node,
+    entity: Publisher | Subscription,
+    group: CallbackGroup,
+    changed: Callable[[], None],
+) -> Callable[[], None]:
+    """Call `changed` each time that peers of an endpoint were matched or unmatched.
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
         entity: what to watch.
         group: reentrant.
         changed: is called.
-    """
 
-    def __init__(
-        self,
-        node: Node,
-        entity: Publisher | Subscription,
-        group: CallbackGroup,
-        changed: Callable[[], None],
-    ) -> None:
-        self._node = node
-        self._handler: EventHandler | None = None
-        event = (
-            QoSPublisherEventType.RCL_PUBLISHER_MATCHED
-            if isinstance(entity, Publisher)
-            else QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
+    Returns:
+        What ends it, before the endpoint is destroyed.
+    """
+    event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
+    if isinstance(entity, Publisher):
+        event = QoSPublisherEventType.RCL_PUBLISHER_MATCHED
+    try:
+        handler = EventHandler(
+            callback_group=group,
+            callback=lambda _: changed(),
+            event_type=event,
+            parent_impl=entity.handle,
         )
-        try:
-            self._handler = EventHandler(
-                callback_group=group,
-                callback=lambda _: changed(),
-                event_type=event,
-                parent_impl=entity.handle,
-            )
-        except UnsupportedEventTypeError:
-            return  # an RMW without the event: counts are then read on request
-        node.add_waitable(self._handler)
+    except UnsupportedEventTypeError:
+        return lambda: None  # an RMW without the event: counts are then read on request
+    node.add_waitable(handler)
 
-    def stop(self) -> None:
-        """End it, before the endpoint is destroyed; again is harmless."""
-        if self._handler is not None:
-            self._node.remove_waitable(self._handler)
-            self._handler.destroy()
-            self._handler = None
+    def stop() -> None:
+        node.remove_waitable(handler)
+        handler.destroy()
+
+    return stop
 
 
-class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What only code can say of how an endpoint is made; as in rclpy's factories.
-
-    Attributes:
-        callback_group: of its callback and its events; None for the node's own choice.
-        event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
-        raw: a subscription's handler is given serialized bytes.
-        introspection: of a service server or client (REP-2012).
-    """
-
-    callback_group: CallbackGroup | None = None
-    event_callbacks: Any = None
-    raw: bool = False
-    introspection: ServiceIntrospectionState | None = None
-
-    def refuse_unfit(self, kind: EndpointKind) -> None:
-        """Raise LifecycleError for what endpoints of a kind cannot have."""
-        for name, fitting in _FITTING.items():
-            if getattr(self, name) not in (None, False) and kind not in fitting:
-                nouns = ", ".join(f"{each.noun}s" for each in fitting)
-                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
+def refuse_unfit(kind: EndpointKind, options: Iterable[str]) -> None:
+    """Raise LifecycleError for what endpoints of a kind cannot have."""
+    for name in options:
+        fitting = _FITTING.get(name, (kind,))
+        if kind not in fitting:
+            nouns = ", ".join(f"{each.noun}s" for each in fitting)
+            raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
 
 
 _FITTING = {
@@ -176,23 +151,16 @@ _FITTING = {
 }
 
 
-class Watch(Protocol):
-    """What notifies of the peers or the server of an endpoint."""
-
-    def stop(self) -> None:
-        """End it, before the endpoint is destroyed; again is harmless."""
-
-
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The rclpy object of an endpoint on one connection.
 
     Attributes:
-        watch: notifies of its peers or its server; None where nothing is watched.
+        unwatch: ends that its peers or its server are watched; None where they are not.
     """
 
     connection: Connection
     entity: Any
-    watch: Watch | None = None
+    unwatch: Callable[[], None] | None = None
 
 
 class Endpoint(msgspec.Struct, kw_only=True, eq=False):
@@ -205,14 +173,14 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         handler: takes messages, requests or goals; None where the kind has no handler.
         handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
+        handover: it is on two connections now; None usually.
         is_late: it was declared after configure, and goes with cleanup.
         error: why it could not be made as asked; empty if it was.
         fault: what its handler raised at the last goal of an action; empty if it returned.
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
-        peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
-        options: how it is made, as far as code says it.
+        options: how it is made, as far as code says it by `set_options`.
     """
 
     planned: PlannedEndpoint
@@ -221,14 +189,14 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     handler: Callable[..., Any] | None = None
     handle: DeclaredPublisher | None = None
     placement: Placement | None = None
+    handover: Handover | None = None
     is_late: bool = False
     error: str = ""
     fault: str = ""
     given_name: str = ""
-    peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None
-    options: EndpointOptions = EndpointOptions()
+    options: dict[str, Any] = {}
 
     @property
     def kind(self) -> EndpointKind:
@@ -265,20 +233,6 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     def connection(self) -> Connection | None:
         """Where it is mapped; None while it is nowhere."""
         return None if self.placement is None else self.placement.connection
-
-
-def found_endpoint(kind: EndpointKind, placement: Placement, at: Position) -> Endpoint:
-    """Return an endpoint that only the code that made it knows of.
-
-    Args:
-        kind: what it is.
-        placement: its rclpy object.
-        at: where its node is declared.
-    """
-    type_ = interface_name(interface_of(placement.entity))
-    resolved = wire_name(placement.entity)
-    planned = PlannedEndpoint(kind=kind, name="", resolved=resolved, type=type_, qos=None, at=at)
-    return Endpoint(planned=planned, placement=placement)
 
 
 def interface_name(interface: type[Any]) -> str:

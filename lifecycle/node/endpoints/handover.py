@@ -9,8 +9,13 @@ delivered twice.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rclpy.task import Future
+
+if TYPE_CHECKING:
+    from lifecycle.node.endpoints.endpoint import Placement
+    from lifecycle.node.lifecycle.services import Turns
 
 SETTLE_S = 0.25
 """The old one lives on after the new one has matched as many peers as it had."""
@@ -21,36 +26,38 @@ PATIENCE_S = 4.0
 A participant that others have not noticed at once is announced again after 3 s.
 """
 
-After = Callable[[float, Callable[[], None]], Callable[[], None]]
-"""Calls back once, so many seconds later, in the executor; returns what calls that off."""
-
 
 class Handover:
     """One endpoint that is handed over.
 
     Args:
-        peers_before: how many peers the old one had.
-        after: the timer.
+        old: where it is until then.
+        peers_before: how many peers it had there.
+        turns: of its node.
         finish: destroys the old one; called exactly once.
 
     Attributes:
+        old: as given.
         done: the old one is destroyed.
     """
 
-    def __init__(self, *, peers_before: int, after: After, finish: Callable[[], None]) -> None:
+    def __init__(
+        self, old: Placement, peers_before: int, turns: Turns, finish: Callable[[], None]
+    ) -> None:
+        self.old = old
         self.done: Future = Future()
         self._peers_before = peers_before
-        self._after = after
+        self._turns = turns
         self._finish = finish
         self._settles = False
-        self._call_off = after(PATIENCE_S, self.end)
+        self._call_off = turns.call_after(PATIENCE_S, self.end)
 
     def peers_changed(self, peers: int) -> None:
         """The new one has so many peers now."""
         if peers >= self._peers_before and not self._settles and not self.done.done():
             self._settles = True
             self._call_off()
-            self._call_off = self._after(SETTLE_S, self.end)
+            self._call_off = self._turns.call_after(SETTLE_S, self.end)
 
     def end(self) -> None:
         """Break now; again is harmless."""
@@ -59,10 +66,3 @@ class Handover:
         self._call_off()
         self.done.set_result(None)
         self._finish()
-
-
-def nothing_to_hand_over() -> Future:
-    """Return what is done already."""
-    future: Future = Future()
-    future.set_result(None)
-    return future

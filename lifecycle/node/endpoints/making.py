@@ -1,8 +1,7 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
-Owns: which factory of rclpy makes which kind, with which QoS, callback group and gate; those of our
-own node are for what its author's code makes. It keeps nothing but the goals of action servers:
-what exists where is data_layer.py's.
+The factories of our own node are for what its author's code makes. What exists where is
+data_layer.py's.
 """
 
 from __future__ import annotations
@@ -24,32 +23,32 @@ from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
 from lifecycle.node.lifecycle.gate import GatedSubscription
-from lifecycle.node.lifecycle.steps import positional_count
+from lifecycle.node.lifecycle.steps import called
 
 if TYPE_CHECKING:
+    from lifecycle.node.author.managed import Managed
     from lifecycle.node.connections.connections import Connection
-    from lifecycle.node.lifecycle.gate import NodeGate
-    from lifecycle.node.lifecycle.services import Turns
+
+
+_DESTROY = {
+    EndpointKind.PUBLISHER: "destroy_publisher",
+    EndpointKind.SUBSCRIPTION: "destroy_subscription",
+    EndpointKind.SERVICE_SERVER: "destroy_service",
+    EndpointKind.SERVICE_CLIENT: "destroy_client",
+}
 
 
 class Maker:
-    """Makes and destroys the entities of one node.
+    """Makes and destroys the entities of one node, whose executor runs their callbacks.
 
-    Args:
-        node: whose endpoints they are, and whose executor runs their callbacks.
-        gate: holds subscriptions back; publishers are held back by their handles.
-        turns: of the node's executor.
-        changed: called when what the node reports of an endpoint has changed.
+    Its gate holds subscriptions back; publishers are held back by their handles.
     """
 
-    def __init__(
-        self, node: Node, gate: NodeGate, turns: Turns, changed: Callable[[], None]
-    ) -> None:
-        self._node = node
-        self._gate = gate
-        self._turns = turns
-        self._changed = changed
-        self._goals: dict[int, Goals] = {}  # by id of the action server
+    def __init__(self, managed: Managed) -> None:
+        self._node = managed.node
+        self._gate = managed.gate
+        self._turns = managed.turns
+        self._changed = managed.configuration_changes.touch
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
         """Return a new rclpy entity of an endpoint on a connection.
@@ -57,7 +56,7 @@ class Maker:
         Raises:
             LifecycleError: the RMW refused, with its reason; nothing is left.
         """
-        kind, introspection = endpoint.kind, endpoint.options.introspection
+        kind, introspection = endpoint.kind, endpoint.options.get("introspection")
         make = self._served
         if kind is EndpointKind.PUBLISHER:
             make = self._publisher
@@ -70,7 +69,7 @@ class Maker:
             )
         made = wire_name(entity)
         if endpoint.given_name and made and made != endpoint.given_name:
-            self.unmake(endpoint, entity, connection)
+            self.unmake(kind, entity, connection)
             raise LifecycleError(
                 f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
                 f"rule that the node was started with makes it {made!r}",
@@ -78,24 +77,15 @@ class Maker:
             )
         return entity
 
-    def unmake(self, endpoint: Endpoint, entity: Any, connection: Connection) -> None:
+    def unmake(self, kind: EndpointKind, entity: Any, connection: Connection) -> None:
         """Destroy an entity that `make` returned for an endpoint on a connection."""
-        goals = self._goals.pop(id(entity), None)
-        if goals is not None:
-            goals.interrupt("it was taken off where it was mapped")
         self._gate.remove(entity)
         if connection.participant is not None:
             connection.participant.destroy_endpoint(entity)
-        elif endpoint.kind.is_action:
+        elif kind.is_action:
             entity.destroy()
-        elif endpoint.kind is EndpointKind.PUBLISHER:
-            self._node.destroy_publisher(entity)
-        elif endpoint.kind is EndpointKind.SUBSCRIPTION:
-            self._node.destroy_subscription(entity)
-        elif endpoint.kind is EndpointKind.SERVICE_SERVER:
-            self._node.destroy_service(entity)
         else:
-            self._node.destroy_client(entity)
+            getattr(self._node, _DESTROY[kind])(entity)
 
     def expand(self, endpoint: Endpoint, name: str) -> str:
         """Return a new name for an endpoint fully qualified; no remapping rule applies.
@@ -116,10 +106,7 @@ class Maker:
 
     def _publisher(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
         qos = endpoint.planned.qos or QosProfile()
-        options = {
-            "callback_group": endpoint.options.callback_group,
-            "event_callbacks": endpoint.options.event_callbacks,
-        }
+        options = endpoint.options
         if connection.participant is not None:
             return connection.participant.create_publisher(endpoint.interface, name, qos, **options)
         return create_publisher(
@@ -127,7 +114,6 @@ class Maker:
         )
 
     def _subscription(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        options = endpoint.options
         make: Callable[..., Any] = functools.partial(create_subscription, self._node)
         if connection.participant is not None:
             make = connection.participant.create_subscription
@@ -137,79 +123,58 @@ class Maker:
             endpoint.handler,
             endpoint.planned.qos or QosProfile(),
             unique=endpoint.planned.unique,
-            callback_group=options.callback_group,
-            event_callbacks=options.event_callbacks,
-            raw=options.raw,
+            **endpoint.options,
         )
-        self._gate.add(entity, GatedSubscription(entity, self._turns.call_soon))
+        self._gate.add(entity, GatedSubscription(entity, self._gate, self._turns.call_soon))
         return entity
 
     def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
         """Make an end of a service or an action."""
-        kind = endpoint.kind
-        makes = {
-            EndpointKind.SERVICE_SERVER: self._service,
-            EndpointKind.SERVICE_CLIENT: self._client,
-            EndpointKind.ACTION_SERVER: self._action_server,
-            EndpointKind.ACTION_CLIENT: self._action_client,
-        }
+        make = functools.partial(self._served_on, endpoint, name=name)
         # rcl applies rules to an action's hidden names itself; torn apart, it is not made.
-        is_torn = kind.is_action and connection.participant is None
-        resolved = resolve_action_name(self._node, name) if is_torn else name
-        make = functools.partial(makes[kind], endpoint, name=name)
-        if connection.participant is None:
-            entity = make(self._node)
+        resolved = name
+        if connection.participant is not None:
+            entity = connection.participant.create(make, endpoint.kind.noun, name)
         else:
-            entity = connection.participant.create(make, kind.noun, name)
-        if kind.is_action:
+            if endpoint.kind.is_action:
+                resolved = resolve_action_name(self._node, name)
+            entity = make(self._node)
+        if endpoint.kind.is_action:
             entity.action_name = resolved
         return entity
 
-    def _service(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+    def _served_on(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+        kind, interface = endpoint.kind, endpoint.interface
+        # Answers of clients arrive while callbacks run.
+        own = self._turns.group if kind in CLIENTS else self._node.default_callback_group
+        group = endpoint.options.get("callback_group") or own
+        if kind.is_action:
+            # Late: numpy, 100 ms.
+            from lifecycle.middleware.services.actions import GoalClient, GoalServer
+
+            if kind is EndpointKind.ACTION_CLIENT:
+                return GoalClient(
+                    node, interface, name, group=group, refuse_to_block=refuse_to_block
+                )
+            goals = Goals(self._node, endpoint, self._gate, self._changed)
+            goals.server = GoalServer(
+                node, interface, name, goals.execute, accept=goals.accept, group=group
+            )
+            self._gate.add_worker(goals.server, goals.end)
+            return goals.server
+        options: dict[str, Any] = {"callback_group": group}
+        if endpoint.planned.qos is not None:
+            options["qos_profile"] = to_rclpy(endpoint.planned.qos)
+        if kind is EndpointKind.SERVICE_CLIENT:
+            client = Node.create_client(node, interface, name, **options)
+            refuse_to_deadlock(client)
+            return client
         assert endpoint.handler is not None
-        handler = _answering(endpoint.handler)
-        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        service = Node.create_service(node, endpoint.interface, name, handler, **options)
+        service = Node.create_service(
+            node, interface, name, _answering(endpoint.handler), **options
+        )
         self._survive_late_answers(service, endpoint.name)
         return service
-
-    def _client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        client = Node.create_client(node, endpoint.interface, name, **options)
-        refuse_to_deadlock(client)
-        return client
-
-    def _action_server(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
-
-        is_open, changed = lambda: self._gate.is_open, self._changed
-        goals = Goals(self._node, endpoint, is_open=is_open, changed=changed)
-        server = goals.server = GoalServer(
-            node,
-            endpoint.interface,
-            name,
-            goals.execute,
-            accept=goals.accept,
-            group=self._group(endpoint),
-        )
-        self._goals[id(server)] = goals
-        self._gate.add_worker(server, goals)
-        return server
-
-    def _action_client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        from lifecycle.middleware.services.actions import GoalClient
-
-        group = self._group(endpoint)
-        return GoalClient(
-            node, endpoint.interface, name, group=group, refuse_to_block=refuse_to_block
-        )
-
-    def _group(self, endpoint: Endpoint) -> Any:
-        """Return its callback group: answers of clients arrive while callbacks run."""
-        own = self._turns.group
-        if endpoint.kind not in CLIENTS:
-            own = self._node.default_callback_group
-        return endpoint.options.callback_group or own
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
         """Return what an endpoint is called where it is made.
@@ -246,20 +211,11 @@ def resolve_name(node: Node, kind: EndpointKind, name: str) -> str:
     return str(resolve(name))
 
 
-def _qos(endpoint: Endpoint) -> dict[str, Any]:
-    """Return the keyword for a declared QoS; nothing keeps the default for services."""
-    if endpoint.planned.qos is None:
-        return {}
-    return {"qos_profile": to_rclpy(endpoint.planned.qos)}
-
-
 def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
     """Let a service handler return None once it has filled in the response."""
 
     async def answer(request: Any, response: Any) -> Any:
-        returned = handler(*(request, response)[: positional_count(handler, 2)])
-        if hasattr(returned, "__await__"):
-            returned = await returned
+        returned = await called(handler, request, response)
         return response if returned is None else returned
 
     return answer

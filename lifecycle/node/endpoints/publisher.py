@@ -1,10 +1,8 @@
 """The publisher handle of a declared endpoint, and its TRANSIENT_LOCAL history across connections.
 
-Owns: the handle that `self.publisher("video")` returns, one object per declared name. It exists
-from configure until cleanup; the rclpy publisher behind it is made by connect and destroyed by
-disconnect. And `Kept`, the messages of a TRANSIENT_LOCAL publisher: DDS keeps such a history in the
-writer, for late-joining subscriptions, and each connection has a writer of its own (DDS 1.4,
-2.2.3.4).
+The handle exists from configure until cleanup; the rclpy publisher behind it is made by connect and
+destroyed by disconnect. DDS keeps a TRANSIENT_LOCAL history in the writer, for late-joining
+subscriptions, and each connection has a writer of its own (DDS 1.4, 2.2.3.4).
 """
 
 from __future__ import annotations
@@ -134,11 +132,6 @@ class DeclaredPublisher:
     def topic_name(self) -> str:
         """Fully qualified; empty while not connected."""
         return str(self._entity.topic_name) if self._entity is not None else ""
-
-    @property
-    def is_activated(self) -> bool:
-        """What is published goes out, as rclpy's lifecycle publishers say it."""
-        return self._is_open and self._entity is not None
 
     def assert_liveliness(self) -> None:
         """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""

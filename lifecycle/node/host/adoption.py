@@ -1,8 +1,6 @@
 """Make the nodes of the user's classes and functions, each as one planned node.
 
-Owns: `Adoption`, which gives the nodes that a class or function constructs the names, parameters,
-remaps and participants of the plan; `Participants`, which nodes of a process share one; and what a
-class must be to be hosted.
+They get the names, parameters, remaps and participants of the plan.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
 from lifecycle.node.author import parameters
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, load_nodes
+from lifecycle.node.author.spec import Construction, load_nodes
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.plan.model import PlannedNode
 
@@ -93,7 +91,6 @@ class Adoption:
         context: of the process: its first nodes are constructed on it.
         loop: runs the callbacks of nodes that are not ours.
         supervisor: name of the system whose gate holds the nodes; empty for none.
-        mode: what drives the nodes; None leaves that to their own code.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
@@ -108,17 +105,15 @@ class Adoption:
         loop: NodeLoop,
         *,
         supervisor: str = "",
-        mode: Mode | None = Mode.MANUAL,
         use_global_arguments: bool = False,
     ) -> None:
         self.participants = Participants(context)
         self._loop = loop
         self._supervisor = supervisor
-        self._mode = mode
         self._use_global_arguments = use_global_arguments
         self._waiting: list[PlannedNode] = []
         self._current: PlannedNode | None = None
-        self._taken: PlannedNode | None = None
+        self._unplanned: Construction | None = None
         self._constructed: dict[str, Node] = {}
         self._foreign: dict[int, ForeignNode] = {}
         self.made: dict[str, Hosted] = {}
@@ -137,13 +132,8 @@ class Adoption:
         Raises:
             LifecycleError: something else was made. What the class or function raises passes.
         """
-        self._waiting = [each for each in group if each.key not in self.made]
-        self._current = planned
-        try:
-            with constructing(self):
-                returned = what(**keywords(planned, what))
-        finally:
-            self._waiting, self._current = [], None
+        with self.expecting(planned, group):
+            returned = what(**keywords(planned, what))
         self._check(planned, what, returned)
         made: list[Hosted] = []
         for key, node in self._constructed.items():
@@ -155,18 +145,22 @@ class Adoption:
         self._constructed.clear()
         return tuple(made)
 
+    @contextlib.contextmanager
+    def expecting(self, planned: PlannedNode, group: Sequence[PlannedNode]) -> Iterator[None]:
+        """Take nodes that are constructed in the block for those of the plan."""
+        self._waiting = [each for each in group if each.key not in self.made]
+        self._current = planned
+        try:
+            yield
+        finally:
+            self._waiting, self._current = [], None
+
     def make_unplanned(self, what: Callable[..., Any]) -> Managed:
-        """Construct a LifecycleNode that has no plan."""
-        with self.participants.carrying(ParticipantSettings()) as context:
-            construction = Construction(
-                spec=None,
-                mode=self._mode,
-                context=context,
-                use_global_arguments=self._use_global_arguments,
-            )
-            with constructing(construction):
-                made: Managed = what().lifecycle
-                return made
+        """Construct a LifecycleNode that has no plan, on the default context."""
+        with self.participants.carrying(ParticipantSettings()):
+            self._unplanned = Construction(spec=None)
+            made: Managed = what().lifecycle
+            return made
 
     def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
         reference = planned.run.python
@@ -194,40 +188,33 @@ class Adoption:
                 hint="it must neither spin nor destroy them: the host does",
             )
 
-    # What constructors ask: LifecycleNode's by author/spec.py, all others by middleware's hooks.
-
-    def take(self, name: str, namespace: str | None) -> Construction | None:
-        """Return the construction of a LifecycleNode that is about to be made."""
-        planned = self._taken = self._take(name, namespace)
-        if planned is None:
-            return None
-        return Construction(
-            spec=planned,
-            mode=self._mode,
-            use_global_arguments=self._use_global_arguments,
-            # Of a plain node no states are driven.
-            supervisor=self._supervisor if planned.managed else "",
-        )
+    # What rclpy's constructors and factories ask.
 
     @contextlib.contextmanager
     def constructing(
         self, node: Node, name: str, options: dict[str, Any]
     ) -> Iterator[tuple[str, dict[str, Any]]]:
         """Have rclpy construct a node as planned; one that is not planned is not touched."""
+        planned = self._take(name, options.get("namespace"))
         ours = isinstance(node, LifecycleNode)
-        planned = self._taken if ours else self._take(name, options.get("namespace"))
-        self._taken = None
         if planned is None:
+            if ours and self._unplanned is not None:
+                node._construction, self._unplanned = self._unplanned, None  # noqa: SLF001
+                options["use_global_arguments"] = self._use_global_arguments
             yield name, options
             return
         refuse_unmanaged(planned, type(node))
-        if not ours:
-            name, options = planned.name, parameters.planned_options(planned, options)
-            options["namespace"] = planned.namespace
-            options["use_global_arguments"] = self._use_global_arguments
-            parameters.give_empty_arrays(node, planned)
+        options = parameters.planned_options(node, planned, options)
+        options["namespace"] = planned.namespace
+        options["use_global_arguments"] = self._use_global_arguments
+        if ours:
+            # Of a plain node no states are driven.
+            supervisor = self._supervisor if planned.managed else ""
+            node._construction = Construction(  # noqa: SLF001 - it is for us
+                spec=planned, supervisor=supervisor
+            )
         with self.participants.carrying(ParticipantSettings.of(planned)) as context:
-            yield name, {**options, "context": context}
+            yield planned.name, {**options, "context": context}
         if not (ours and planned.managed):
             self._foreign[id(node)] = ForeignNode(
                 node, planned, supervisor=self._supervisor, loop=self._loop

@@ -1,21 +1,17 @@
 """The control channel between a supervisor and its host processes: messages and the host's end.
 
-Owns: the messages, one JSON object per line over an inherited AF_UNIX stream socket; reading and
-writing these lines in a host, and the descriptors that arrive beside the first byte.
-
-It carries what the lifecycle services and `~/get_configuration` carry, without waiting for
-discovery; both ways drive the same state machine. End of file from the supervisor makes a host shut
-down; without an END before it the supervisor was killed, and nodes are deactivated first. Imports
-no rclpy.
+One JSON object per line over an inherited AF_UNIX stream socket. It carries what the lifecycle
+services and `~/get_configuration` carry, without waiting for discovery; both ways drive the same
+state machine. End of file from the supervisor makes a host shut down; without an END before it the
+supervisor was killed, and nodes are deactivated first. Imports no rclpy.
 """
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import importlib
-import logging
 import os
-import select
 import socket
 import sys
 import threading
@@ -157,7 +153,10 @@ _LAST_S = 1.0
 """For a supervisor to read what is still to be sent when a host ends."""
 
 _NEWEST = frozenset({"state", "configuration", "beat", "measured"})
-"""Events of which only the latest of a node is worth sending to who has not read the one before."""
+"""Events of which only the latest of a node is worth sending to who does not read."""
+
+_MANY = 16
+"""So many events wait for a supervisor that does not read."""
 
 
 class HostChannel:
@@ -183,10 +182,10 @@ class HostChannel:
         for descriptor in found:
             os.set_inheritable(descriptor, False)
         self._changed = threading.Condition()
-        self._begun = b""  # the rest of a line of which a part was sent
         self._kept: dict[tuple[object, ...], bytes] = {}  # by what it is of, in order
         self._number = 0
         self._sends = False
+        threading.Thread(target=self._send, name="reports", daemon=True).start()
 
     def fileno(self) -> int:
         """Return the descriptor that is readable when `receive` is worth a call."""
@@ -194,12 +193,10 @@ class HostChannel:
 
     def read(self) -> bytes | None:
         """Wait for the next line and return it, or None at end of file."""
-        while b"\n" not in self._received:
+        while (line := next(self.lines(), None)) is None:
             if not self.receive():
                 return None
-        line, _, rest = self._received.partition(b"\n")
-        self._received = rest
-        return bytes(line)
+        return line
 
     def receive(self) -> bool:
         """Wait for more and keep it for `lines`; False at end of file."""
@@ -217,54 +214,33 @@ class HostChannel:
             yield bytes(line)
 
     def write(self, event: Event) -> None:
-        """Send one event, now or later; that a supervisor has gone is noticed by the reader."""
+        """Send one event; that a supervisor has gone is noticed by the reader."""
         line = codec.to_json(event) + b"\n"
         with self._changed:
             self._number += 1
-            key = (event.kind, event.node) if event.kind in _NEWEST else (self._number,)
-            self._kept.pop(key, None)  # the newer one takes a place behind all others
+            key: tuple[object, ...] = (self._number,)
+            if event.kind in _NEWEST and len(self._kept) >= _MANY:
+                key = (event.kind, event.node)
+                self._kept.pop(key, None)  # the newer one takes a place behind all others
             self._kept[key] = line
-            if self._sends or self._flush():
-                return
-            self._sends = True
-            try:
-                threading.Thread(target=self._send, name="reports", daemon=True).start()
-            except RuntimeError:  # at the limit of threads: the next report tries again
-                self._sends = False
+            self._changed.notify_all()
 
     def drain(self) -> None:
         """Wait until all was sent, as long as a supervisor that runs may take."""
         with self._changed:
-            self._changed.wait_for(lambda: not (self._begun or self._kept), _LAST_S)
-
-    def _flush(self) -> bool:
-        """Send what there is room for, with the lock held; whether that is all."""
-        while self._begun or self._kept:
-            if not self._begun:
-                self._begun = self._kept.pop(next(iter(self._kept)))
-            try:
-                sent = self._control.send(self._begun, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return False
-            except OSError as error:
-                logging.getLogger(__name__).debug("cannot report to the supervisor: %s", error)
-                self._begun = b""
-                self._kept.clear()
-                break
-            self._begun = self._begun[sent:]
-        return True
+            self._changed.wait_for(lambda: not (self._sends or self._kept), _LAST_S)
 
     def _send(self) -> None:
         """Send what is kept, as soon as there is room for it."""
-        room = select.poll()
-        room.register(self._control, select.POLLOUT)
         while True:
-            room.poll()
             with self._changed:
-                if self._flush():
-                    self._sends = False
-                    self._changed.notify_all()
-                    return
+                self._sends = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._kept)
+                line = self._kept.pop(next(iter(self._kept)))
+                self._sends = True
+            with contextlib.suppress(OSError):
+                self._control.sendall(line)
 
 
 def report_failure(channel: HostChannel, node: str, error: Exception) -> None:

@@ -16,11 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import (
-    EventHandler,
-    QoSPublisherEventType,
-    QoSSubscriptionEventType,
-)
+from rclpy.event_handler import QoSPublisherEventType, QoSSubscriptionEventType
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -29,13 +25,12 @@ from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
-    Watching,
     follow_goals,
     is_rclpy_managed,
 )
@@ -44,7 +39,7 @@ from lifecycle.node import configuration
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.node_interface import serve_interface
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
+from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, Placement, watch_matches
 from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
@@ -52,8 +47,6 @@ from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-
     from lifecycle.node.endpoints.data_layer import DataLayer
     from lifecycle.node.host.loop import NodeLoop
 
@@ -64,53 +57,11 @@ _MATCHED = {
     EndpointKind.PUBLISHER: QoSPublisherEventType.RCL_PUBLISHER_MATCHED,
     EndpointKind.SUBSCRIPTION: QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED,
 }
+_OPTIONS = ("callback_group", "event_callbacks", "publisher_class", "raw")
+"""Of rclpy's factories, which those of other participants take, too."""
 _REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
-
-
-class SharedMatch:
-    """A matched event that a node's own code handles, and its host needs.
-
-    rmw counts the changes for one handler: two in different executors take them from each other.
-
-    Args:
-        node: whose it is.
-        event: its own handler.
-        group: that the host's executor runs it in.
-        watching: has it from now on.
-        changed: called for each event.
-        forward: has the node's callback called with the status.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        event: EventHandler,
-        group: CallbackGroup,
-        watching: Watching,
-        *,
-        changed: Callable[[], None],
-        forward: Callable[[Callable[[Any], Any], Any], None],
-    ) -> None:
-        self.node = node
-        self._event = event
-        self._watching = watching
-        callback = event.callback
-
-        def handle(status: Any) -> None:
-            changed()
-            forward(callback, status)
-
-        node.remove_waitable(event)
-        event.callback = handle
-        event.callback_group = group
-        watching.add_waitable(event)
-
-    def stop(self) -> None:
-        """Wait for it no more: its endpoint is about to be destroyed, by its node."""
-        self._watching.remove_waitable(self._event)
-        self.node.add_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):
@@ -156,34 +107,29 @@ class ForeignNode:
 
     Attributes:
         node: rclpy's.
+        full_name: its name, fully qualified.
+        listeners: are called with it after every change of state, whatever caused it.
         spec: what it was planned to be.
         gate: holds back what it publishes, and counts what arrives.
         configuration_changes: notifies of each change of its configuration.
+        connections: its participants.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        spec: PlannedNode,
-        *,
-        supervisor: str,
-        loop: NodeLoop,
-    ) -> None:
+    def __init__(self, node: Node, spec: PlannedNode, *, supervisor: str, loop: NodeLoop) -> None:
         self.node = node
+        self.full_name = str(node.get_fully_qualified_name())
         self.spec = spec
         self._supervisor = supervisor
         self._loop = loop
         self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
-        self.gate = NodeGate()
+        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
-        self._connections = Connections(node)
+        self.connections = Connections(node, spec.participants)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
-        self._faults: dict[int, str] = {}  # by id of the action server
-        self._listeners: list[Callable[[Any], None]] = []
+        self.listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
-        self._is_ours = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
@@ -200,19 +146,12 @@ class ForeignNode:
     def _serve(self) -> tuple[Any, ...]:
         """Offer what others know our nodes by; the host answers, also while the node is held."""
         before = set(self.node.services)
-        self._is_ours = True
         configuration.serve(self.node, self.get_configuration, self._group)
         # With it a node is known to be one of ours.
         serve_interface(self.node, {"map_to": lambda _: self.data_layer}, self._group)
-        self._is_ours = False
         services = tuple(each for each in self.node.services if each not in before)
         self._watching.take_services(self.node, services)
         return services
-
-    @property
-    def full_name(self) -> str:
-        """Fully qualified node name."""
-        return str(self.node.get_fully_qualified_name())
 
     @property
     def reported(self) -> HostedState:
@@ -222,55 +161,57 @@ class ForeignNode:
         label = self._machine.label
         return HostedState(label=label, connected=label in _CONNECTED, steady=label in _STEADY)
 
-    def add_listener(self, listener: Callable[[Any], None]) -> None:
-        """Call `listener(self)` after every change of state, whatever caused it."""
-        self._listeners.append(listener)
-
     # What its class makes.
 
     def made(self, kind: EndpointKind, entity: Any) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
-        if self._is_ours:
-            return
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
             self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self.gate.add(entity, CountedSubscription(entity))
-        watch: Watch | None = None
+            self.gate.add(entity, CountedSubscription(entity, self.gate))
+        unwatch: Callable[[], None] | None = None
         if kind.is_topic:
-            # In the host's executor: the node's own need not run.
-            watch = self._match_watch(kind, entity)
+            unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
-            watch = ServerWatch(self.node, entity, self.configuration_changes.touch)
-        elif kind is EndpointKind.ACTION_SERVER:
-            follow_goals(entity, functools.partial(self._goal_ended, id(entity)))
-        connection = self._apart.pop(id(entity), self._connections.own)
-        self._found.add(kind, Placement(connection=connection, entity=entity, watch=watch))
+            unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
+        connection = self._apart.pop(id(entity), self.connections.own)
+        placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
+        endpoint = self._found.add(kind, placement)
+        if kind is EndpointKind.ACTION_SERVER:
+            follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
-    def _goal_ended(self, server: int, error: Exception | None) -> None:
+    def _goal_ended(self, endpoint: Endpoint, error: Exception | None) -> None:
         """Keep what the handler of an action raised at its last goal."""
         fault = "" if error is None else f"its handler raised {error_text(error)}"
-        if fault != self._faults.get(server, ""):
-            self._faults[server] = fault
+        if fault != endpoint.fault:
+            endpoint.fault = fault
             self.configuration_changes.touch()
 
-    def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
+    def _watch_matches(self, kind: EndpointKind, entity: Any) -> Callable[[], None]:
+        """Watch in the host's executor, for the node's own need not run; returns what ends that."""
+        watching: Any = self._watching
         touch = self.configuration_changes.touch
-        for event in entity.event_handlers:
-            if event.event_type == _MATCHED[kind]:
-                return SharedMatch(
-                    self.node,
-                    event,
-                    self._group,
-                    self._watching,
-                    changed=touch,
-                    forward=self._forward,
-                )
-        sink: Any = self._watching
-        return MatchWatch(sink, entity, self._group, touch)
+        event = next((e for e in entity.event_handlers if e.event_type == _MATCHED[kind]), None)
+        if event is None:
+            return watch_matches(watching, entity, self._group, touch)
+        # rmw counts the changes for one handler: two would take them from each other.
+        callback = event.callback
+
+        def handle(status: Any) -> None:
+            touch()
+            self._forward(callback, status)
+
+        def stop() -> None:
+            watching.remove_waitable(event)
+            self.node.add_waitable(event)
+
+        self.node.remove_waitable(event)
+        event.callback, event.callback_group = handle, self._group
+        watching.add_waitable(event)
+        return stop
 
     def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
         """Have a callback of its own called; while it is not spun, the last time once it is."""
@@ -298,32 +239,23 @@ class ForeignNode:
         planned = self._planned(kind, given.get("topic"))
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
-        carrier = next(
-            (each for each in self.spec.participants if each.name == planned.participant), None
-        )
+        publishes = kind is EndpointKind.PUBLISHER
+        connection = self.connections.planned(planned.participant)
+        if connection.participant is None and publishes:
+            return None  # no RMW makes one unique on a participant that others use
         qos = given["qos_profile"]
-        options: dict[str, Any] = {
-            "callback_group": given.get("callback_group"),
-            "event_callbacks": given.get("event_callbacks"),
-        }
-        if kind is EndpointKind.SUBSCRIPTION:
-            options |= {"unique": planned.unique, "raw": given.get("raw", False)}
-        elif "publisher_class" in given:
-            options["publisher_class"] = given["publisher_class"]
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
-        called: tuple[Any, ...] = (profile,)
-        if kind is EndpointKind.SUBSCRIPTION:
-            called = (given["callback"], profile)
-        if carrier is None:
-            if kind is EndpointKind.PUBLISHER:
-                return None  # no RMW makes one unique on a participant that others use
-            make: Callable[..., Any] = create_subscription
-            return make(self.node, given["msg_type"], given["topic"], *called, **options)
-        connection = self._connections.carrier(carrier)
-        assert connection.participant is not None
-        make = connection.participant.create_publisher
-        if kind is EndpointKind.SUBSCRIPTION:
-            make = connection.participant.create_subscription
+        called = (profile,) if publishes else (given["callback"], profile)
+        options = {name: given[name] for name in _OPTIONS if name in given}
+        if not publishes:
+            options["unique"] = planned.unique
+        if connection.participant is None:
+            return create_subscription(
+                self.node, given["msg_type"], given["topic"], *called, **options
+            )
+        make: Callable[..., Any] = connection.participant.create_subscription
+        if publishes:
+            make = connection.participant.create_publisher
         entity = make(given["msg_type"], planned.resolved, *called, **options)
         self._apart[id(entity)] = connection
         return entity
@@ -347,8 +279,8 @@ class ForeignNode:
         placement = self._found.remove(entity)
         if placement is None:
             return
-        if placement.watch is not None:
-            placement.watch.stop()
+        if placement.unwatch is not None:
+            placement.unwatch()
         if isinstance(entity, Publisher) and placement.connection.participant is not None:
             placement.connection.participant.destroy_endpoint(entity)
 
@@ -368,8 +300,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in self._found.endpoints:
-            each.fault = self._faults.get(id(each.entity), "")
+        for each in tuple(self._found.endpoints.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -380,14 +311,7 @@ class ForeignNode:
                 )
             endpoints.append(each)
         endpoints += [Endpoint(planned=each) for each in declared.values()]
-        return configuration.collect(
-            self.node,
-            self.spec,
-            self.reported,
-            endpoints=endpoints,
-            connections=self._connections,
-            measured=self.gate.measured(),
-        )
+        return configuration.collect(self, endpoints)
 
     @property
     def data_layer(self) -> DataLayer:
@@ -402,16 +326,13 @@ class ForeignNode:
             hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
         )
 
-    @property
-    def marks(self) -> tuple[int | None, ...]:
-        """DSCP on the sender sockets of its participants, as it is now."""
-        return self._connections.marks
-
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        self._found.close()
+        for each in tuple(self._found.endpoints.values()):
+            if each.placement is not None and each.placement.unwatch is not None:
+                each.placement.unwatch()
         self._watching.drop_services(self._services)
-        self._connections.close_all()
+        self.connections.close_all()
 
     def destroyed(self) -> None:
         """The node was destroyed, in a process that goes on."""
@@ -436,7 +357,7 @@ class ForeignNode:
         """Activate it, let through by the gate; what does not succeed leaves the gate closed."""
         if self.reported.label == "active" and self._let_through and self._machine is not None:
             return self._transition("activate")  # refused, and it stays as it is
-        succeeded = False
+        result: Result | None = None
         self._release()  # its on_activate may publish
         limit_s = self.spec.timeouts.activate_s
         began_s = time.monotonic()
@@ -444,18 +365,16 @@ class ForeignNode:
             result = self._transition("activate")
             took_s = time.monotonic() - began_s
             if result.outcome is CallbackOutcome.SUCCESS and took_s >= limit_s:
-                # Nobody waits for it any more.
-                self._transition("deactivate")
                 why = (
                     f"cannot accept {self.full_name}: on_activate blocked for {took_s:.1f} s, its "
                     f"deadline is {limit_s:g} s"
                 )
+                result = Result(outcome=CallbackOutcome.ERROR, error=why)
                 self.complain(why)
-                return Result(outcome=CallbackOutcome.ERROR, error=why)
-            succeeded = result.outcome is CallbackOutcome.SUCCESS
+                self._transition("deactivate")  # nobody waits for it any more
             return result
         finally:
-            if not succeeded:
+            if result is None or result.outcome is not CallbackOutcome.SUCCESS:
                 self._hold()
 
     async def bring_up(self) -> Result:
@@ -488,7 +407,7 @@ class ForeignNode:
         if self._supervisor and self.reported.label in ("unconfigured", "finalized"):
             self._let_through = False
             self.gate.close()
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(self)
 
     def complain(self, text: str) -> None:

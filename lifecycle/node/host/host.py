@@ -1,9 +1,6 @@
 """Entry point of a process that hosts nodes for a supervisor, and what it imports before it forks.
 
-Owns: the way in: read the HostSpec (control.py), then let hosting.py construct and run the nodes.
-Importing this module has no side effects and is cheap to fork from: `preload()` imports what a node
-needs, without a participant or a socket, as neither survives a fork; nothing here calls rclpy.init
-before `serve`.
+As a program, `python -m lifecycle.node.host.host DESCRIPTOR`, it serves an inherited socket.
 """
 
 from __future__ import annotations
@@ -12,6 +9,7 @@ import contextlib
 import importlib
 import os
 import socket
+import sys
 from collections.abc import Iterable
 from typing import NoReturn
 
@@ -72,11 +70,6 @@ def preload(types: Iterable[str] = ()) -> None:
             load_type_support(interface)
 
 
-def main(control_socket_fd: int) -> NoReturn:
-    """Serve the control socket with this descriptor; never returns."""
-    serve(socket.socket(fileno=control_socket_fd))
-
-
 def serve(control: socket.socket) -> NoReturn:
     """Host what the first line of `control` says until it ends; never returns.
 
@@ -100,13 +93,5 @@ def serve(control: socket.socket) -> NoReturn:
     Host(spec, context, channel).run()
 
 
-def _main() -> NoReturn:
-    import argparse
-
-    parser = argparse.ArgumentParser(prog="python -m lifecycle.node.host.host", description=__doc__)
-    parser.add_argument("--control-fd", type=int, required=True, help="inherited AF_UNIX socket")
-    main(parser.parse_args().control_fd)
-
-
 if __name__ == "__main__":
-    _main()
+    serve(socket.socket(fileno=int(sys.argv[1])))

@@ -1,11 +1,8 @@
 """Construct and run the nodes of a host process: carry out the supervisor's commands, report back.
 
-Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave, nodes deactivated first if the supervisor was killed; what is reported without a
-request; what each Operation of control.py does to the nodes, by the same state machines that the
-lifecycle services drive, and that each command is answered exactly once. It holds no state of its
-nodes. While the user's modules are imported there is nothing to shut down: then it ends at once,
-and silently.
+A host constructs every node, says "ready", obeys, and at end of file shuts down and leaves, nodes
+deactivated first if the supervisor was killed. While the user's modules are imported there is
+nothing to shut down: then it ends at once, and silently.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import rclpy
@@ -27,7 +24,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Executor
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -45,7 +41,7 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop, on_signal
-from lifecycle.node.lifecycle.steps import CallbackOutcome
+from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -75,17 +71,9 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
 )
 
 
-class ChangedError(LifecycleError):
-    """A node is not activated: it is not any more as it was reported, and is reported again."""
-
-
 def is_marked(hosted: Hosted) -> bool:
     """Whether the plan says what DSCP any endpoint of a node sends with."""
     return any(each.dscp is not None for each in hosted.spec.endpoints)
-
-
-_MARKS_S = 0.5
-"""How often marks are read again; only in processes with nodes that have some."""
 
 
 _LEAVE_S = 0.5
@@ -116,7 +104,8 @@ class Host:
         self._output = _Output(spec.log)
         self._is_orderly = False
         self._left = threading.Event()
-        self._reports = False
+        self._looks = False
+        self._measures = spec.measures
         self._nodes: dict[str, Hosted] = {}
         self._adoption = Adoption(context, self._loop, supervisor=spec.system)
         self._marks: dict[str, tuple[int | None, ...]] = {}
@@ -128,12 +117,11 @@ class Host:
         beside = {self._channel.fileno(): self._receive}
         with on_signal(lambda number: self._end(number.name), beside):
             for index, planned in enumerate(self._spec.nodes):
+                if planned.key in self._adoption.made:
+                    continue  # by the same call as one before it
                 failure: Exception | None = None
                 try:
-                    if planned.key in self._adoption.made:
-                        continue  # by the same call as one before it
-                    maker = self._import(planned)
-                    self._construct(planned, maker)
+                    self._construct(planned, self._import(planned))
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
                 if failure is not None:
@@ -145,11 +133,6 @@ class Host:
 
     def _import(self, planned: PlannedNode) -> Callable[..., Any]:
         """Import a node's class; ending the process meanwhile need not wait for it."""
-        with self._importing():
-            return maker_of(planned, self._spec.folders)
-
-    @contextlib.contextmanager
-    def _importing(self) -> Iterator[None]:
         with self._lock:
             self._imports = True
             if self._ended:
@@ -158,7 +141,7 @@ class Host:
         quiet = () if self._loop.nodes else (signal.SIGINT, signal.SIGTERM)
         before = {number: signal.signal(number, signal.SIG_DFL) for number in quiet}
         try:
-            yield
+            return maker_of(planned, self._spec.folders)
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
@@ -200,10 +183,8 @@ class Host:
         for hosted in self._adoption.make(planned, group, maker):
             self._nodes[hosted.full_name] = hosted
             hosted.gate.measure(self._spec.apart)
-            if planned.run.executor is Executor.EVENTS:
-                hosted.gate.count_nothing()
             if hosted.spec.managed:
-                hosted.add_listener(self._report_state)
+                hosted.listeners.append(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
             self._loop.add(hosted)
 
@@ -214,16 +195,25 @@ class Host:
         if self._spec.joins:
             self._adoption.participants.ask_others()
         self._channel.write(Event(kind="ready"))
-        if any(is_marked(hosted) for hosted in self._nodes.values()):
-            threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
-        if self._spec.measures:
-            self._begin_to_report()
+        if self._measures or any(is_marked(hosted) for hosted in self._nodes.values()):
+            self._begin_to_look()
 
-    def _begin_to_report(self) -> None:
-        """Report what is counted from now on; again is harmless."""
-        if not self._reports:
-            self._reports = True
-            threading.Thread(target=self._report_measured, name="measured", daemon=True).start()
+    def _begin_to_look(self) -> None:
+        """Look again and again at what no event reports; a second time is harmless."""
+        if not self._looks:
+            self._looks = True
+            threading.Thread(target=self._look, name="looks", daemon=True).start()
+
+    def _look(self) -> None:
+        """Report other marks, and what active nodes have counted, whatever their callbacks do."""
+        while not self._left.wait(SLOT_S):
+            for name, hosted in tuple(self._nodes.items()):
+                if self._has_other_marks(hosted):
+                    self._note_marks(hosted)
+                    hosted.configuration_changes.touch()
+                measured = hosted.gate.measured() if self._measures else None
+                if measured is not None:
+                    self._channel.write(Event(kind="measured", node=name, measured=measured))
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported
@@ -309,51 +299,53 @@ class Host:
     def _note_marks(self, node: Hosted) -> None:
         """Take the DSCP of a node's sockets that is reported now."""
         if is_marked(node):
-            self._marks[node.full_name] = node.marks
-
-    def _watch_marks(self) -> None:
-        """Have marks that are not as they were reported reported again: no event says so.
-
-        They are read again and again, whatever the node's callbacks do.
-        """
-        while not self._left.wait(_MARKS_S):
-            for node in tuple(self._nodes.values()):
-                if self._has_other_marks(node):
-                    self._note_marks(node)
-                    node.configuration_changes.touch()
-
-    def _report_measured(self) -> None:
-        """Report again and again what active nodes have counted, whatever their callbacks do."""
-        while not self._left.wait(SLOT_S):
-            for name, hosted in tuple(self._nodes.items()):
-                measured = hosted.gate.measured()
-                if measured is not None:
-                    self._channel.write(Event(kind="measured", node=name, measured=measured))
+            self._marks[node.full_name] = node.connections.marks
 
     def _has_other_marks(self, node: Hosted) -> bool:
         before = self._marks.get(node.full_name)
-        return before is not None and node.marks != before
+        return before is not None and node.connections.marks != before
 
     async def _execute(self, command: Command) -> None:
         """Carry out one command and answer it, whatever happens."""
-        try:
-            reply = await self._carry_out(command)
-        except ChangedError as error:
-            reply = self._reply(command, ok=False, error=str(error), changed=True)
-        except LifecycleError as error:
-            reply = self._reply(command, ok=False, error=str(error), describe=False)
-        except Exception as error:  # noqa: BLE001 - each command is answered exactly once
-            traceback.print_exc()
-            line = f"{type(error).__name__}: {error}"
-            reply = self._reply(command, ok=False, error=line, describe=False)
-        self._channel.write(reply)
-
-    async def _carry_out(self, command: Command) -> Event:
         node = self._nodes.get(command.node)
-        if node is None:
-            known = ", ".join(self._nodes) or "no node"
-            raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
-        operation, ok, error = command.operation, True, ""
+        result, error, changed = None, "", False
+        configuration: NodeConfiguration | None = None
+        try:
+            if node is None:
+                known = ", ".join(self._nodes) or "no node"
+                error = f"cannot find node {command.node!r}; this process hosts {known}"
+            else:
+                changed = command.operation is Operation.ACTIVATE and self._has_other_marks(node)
+                result = _changed(node) if changed else await self._carry_out(node, command)
+                error = result.error
+                if command.operation not in _ANSWERED_WITHOUT_CONFIGURATION or (
+                    # No event reports its sockets: what its callback did to them is read now.
+                    command.operation is Operation.ACTIVATE and is_marked(node)
+                ):
+                    self._note_marks(node)
+                    configuration = node.get_configuration()
+        except LifecycleError as failure:
+            result, error = None, str(failure)
+        except Exception as failure:  # noqa: BLE001 - each command is answered exactly once
+            traceback.print_exc()
+            result, error = None, f"{type(failure).__name__}: {failure}"
+        state = None if node is None else node.reported
+        self._channel.write(
+            Event(
+                kind="reply",
+                node=command.node,
+                id=command.id,
+                ok=result is not None and result.outcome is CallbackOutcome.SUCCESS,
+                state="" if state is None else state.label,
+                connected=state is not None and state.connected,
+                error=error,
+                configuration=configuration,
+                changed=changed,
+            )
+        )
+
+    async def _carry_out(self, node: Hosted, command: Command) -> Result:
+        operation = command.operation
         if operation is Operation.SEND_AGAIN_SOON:
             send_again_soon()
         elif operation is Operation.REPUBLISH_NAMES:
@@ -361,7 +353,8 @@ class Host:
         elif operation is Operation.MEASURE:
             for hosted in self._nodes.values():
                 hosted.gate.measure(command.apart)
-            self._begin_to_report()
+            self._measures = True
+            self._begin_to_look()
         elif operation is Operation.CONNECT_TO:
             node.data_layer.connect_to(command.connection, command.connections)
         elif operation is Operation.MAP_TO:
@@ -369,50 +362,18 @@ class Host:
         elif operation is Operation.DISCONNECT_FROM:
             node.data_layer.disconnect(command.connection)
         elif operation is not Operation.GET_CONFIGURATION:
-            if operation is Operation.ACTIVATE and self._has_other_marks(node):
-                node.configuration_changes.touch()
-                raise ChangedError(
-                    f"cannot activate {node.full_name}: the DSCP of its sockets was changed since "
-                    "it was verified",
-                    hint="look for IP_TOS or IPV6_TCLASS in its code",
-                )
-            result = await node.change_for_supervisor(operation.value)
-            ok, error = result.outcome is CallbackOutcome.SUCCESS, result.error
-        return self._reply(command, ok=ok, error=error)
+            return await node.change_for_supervisor(operation.value)
+        return SUCCESS
 
-    def _reply(
-        self,
-        command: Command,
-        *,
-        ok: bool,
-        error: str = "",
-        describe: bool = True,
-        changed: bool = False,
-    ) -> Event:
-        node = self._nodes.get(command.node)
-        if node is None:
-            return Event(kind="reply", node=command.node, id=command.id, ok=ok, error=error)
-        state = node.reported
-        carries = describe and (
-            command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
-            # No event reports its sockets: what its callback did to them is read when it has ended.
-            or (command.operation is Operation.ACTIVATE and is_marked(node))
-        )
-        configuration = None
-        if carries:
-            self._note_marks(node)
-            configuration = node.get_configuration()
-        return Event(
-            kind="reply",
-            node=command.node,
-            id=command.id,
-            ok=ok,
-            state=state.label,
-            connected=state.connected,
-            error=error,
-            configuration=configuration,
-            changed=changed,
-        )
+
+def _changed(node: Hosted) -> Result:
+    """Return why a node is not activated that is not any more as it was reported."""
+    node.configuration_changes.touch()
+    return Result(
+        outcome=CallbackOutcome.FAILURE,
+        error=f"cannot activate {node.full_name}: the DSCP of its sockets was changed since "
+        "it was verified; look for IP_TOS or IPV6_TCLASS in its code",
+    )
 
 
 class _Output:

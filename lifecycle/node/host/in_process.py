@@ -1,12 +1,11 @@
 """Run one node of a plan inside a test's own process, with a peer to exchange messages with.
 
-Owns: `NodeInProcess`: the thread that spins the node, the peer's endpoints, and the bounded way
-out. Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes these.
+Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes these.
 """
 
 from __future__ import annotations
 
-import collections
+import concurrent.futures
 import functools
 import threading
 import time
@@ -23,7 +22,6 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
-from lifecycle.node.author.managed import Managed
 from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
@@ -70,12 +68,11 @@ class NodeInProcess:
         folder = str(Path(planned.at.file).absolute().parent)
         maker = maker_of(planned, (folder,))
         self._planned = planned
-        self._changed = threading.Condition()
         self._error: BaseException | None = None
-        self._received: dict[str, collections.deque[Any]] = {}
+        self._received: dict[str, list[Any]] = {}
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
-        self._logs: list[str] = []
+        self._logs: list[Any] = []
         self._closed = False
         self._context = Context()
         with discovery_by_profile(ParticipantSettings.of(planned)):
@@ -105,13 +102,14 @@ class NodeInProcess:
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         rosout = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.peer.create_subscription(Log, _ROSOUT, self._take_log, rosout)
+        self.peer.create_subscription(Log, _ROSOUT, self._logs.append, rosout)
         for each in self._planned.endpoints:
             qos = to_rclpy(each.qos)
             if each.kind is EndpointKind.PUBLISHER:
-                taken = self._received[each.name] = collections.deque()
+                taken: list[Any] = []
+                self._received[each.name] = taken
                 self.peer.create_subscription(
-                    import_interface(each.type), each.resolved, self._taker(taken), qos
+                    import_interface(each.type), each.resolved, taken.append, qos
                 )
             elif each.kind is EndpointKind.SUBSCRIPTION:
                 self._publishers[each.name] = self.peer.create_publisher(
@@ -122,20 +120,6 @@ class NodeInProcess:
                     import_interface(each.type), each.resolved
                 )
 
-    def _taker(self, taken: collections.deque[Any]) -> Callable[[Any], None]:
-        def take(message: Any) -> None:
-            with self._changed:
-                taken.append(message)
-                self._changed.notify_all()
-
-        return take
-
-    def _take_log(self, message: Any) -> None:
-        if message.name == self.node.get_logger().name:
-            with self._changed:
-                self._logs.append(message.msg)
-                self._changed.notify_all()
-
     def _spin(self) -> None:
         try:
             while True:
@@ -143,9 +127,7 @@ class NodeInProcess:
         except (ShutdownException, ExternalShutdownException):
             pass
         except BaseException as error:  # noqa: BLE001 - raised in the test's thread
-            with self._changed:
-                self._error = error
-                self._changed.notify_all()
+            self._error = error
 
     @property
     def state(self) -> str:
@@ -155,8 +137,8 @@ class NodeInProcess:
     @property
     def logs(self) -> tuple[str, ...]:
         """What the node has logged so far, all levels that it publishes on /rosout."""
-        with self._changed:
-            return tuple(self._logs)
+        name = self.node.get_logger().name
+        return tuple(each.msg for each in tuple(self._logs) if each.name == name)
 
     def bring_to(self, state: str) -> None:
         """Bring an unconfigured node to "inactive" (connected) or "active", matched with its peer.
@@ -197,13 +179,12 @@ class NodeInProcess:
             BringUpError: a callback returned FAILURE or ERROR, raised, or took too long.
             LifecycleError: it is not allowed in this state, or there is none of this name.
         """
-        hosted = self._hosted
         if not self._planned.managed:
             raise UsageError(
                 f"cannot {transition} {self._planned.full_name}: a plain node has no states"
             )
-        change = hosted.change if isinstance(hosted, Managed) else hosted.change_for_supervisor
-        result: Result = self.run(lambda: change(transition), self._limit_s)
+        change = functools.partial(self._hosted.change_for_supervisor, transition)
+        result: Result = self.run(change, self._limit_s)
         if result.outcome is not CallbackOutcome.SUCCESS:
             raise BringUpError(f"cannot {transition} {self._planned.full_name}: {result.error}")
 
@@ -218,26 +199,21 @@ class NodeInProcess:
         Raises:
             TimeoutError: it is not done within `timeout_s` seconds.
         """
-        done: list[tuple[Any, BaseException | None]] = []
+        future: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
         async def call() -> None:
-            result, error = None, None
             try:
                 result = function()
                 if hasattr(result, "__await__"):
                     result = await result
             except Exception as raised:  # noqa: BLE001 - raised for who called
-                error = raised
-            with self._changed:
-                done.append((result, error))
-                self._changed.notify_all()
+                future.set_exception(raised)
+            else:
+                future.set_result(result)
 
         self._loop.call_soon(call)
-        self._wait(lambda: done, f"cannot finish {function!r}", timeout_s)
-        result, error = done[0]
-        if error is not None:
-            raise error
-        return result
+        self._wait(future.done, f"cannot finish {function!r}", timeout_s)
+        return future.result()
 
     def publish(self, subscription: str, message: Any) -> None:
         """Send a message to a declared subscription, by its declared name."""
@@ -249,10 +225,9 @@ class NodeInProcess:
         Raises:
             TimeoutError: there is none within `timeout_s` seconds.
         """
-        taken: collections.deque[Any] = self._declared(self._received, publisher, "publisher")
+        taken: list[Any] = self._declared(self._received, publisher, "publisher")
         self._wait(lambda: taken, f"cannot receive a message of {publisher!r}", timeout_s)
-        with self._changed:
-            return taken.popleft()
+        return taken.pop(0)
 
     def call(self, service: str, request: Any, timeout_s: float = WAIT_S) -> Any:
         """Call a declared service server, by its declared name; return the response.
@@ -272,7 +247,7 @@ class NodeInProcess:
             TimeoutError: there is none within `timeout_s` seconds.
         """
         self._wait(
-            lambda: any(text in each for each in self._logs),
+            lambda: any(text in each for each in self.logs),
             f"cannot find {text!r} in what was logged",
             timeout_s,
         )
@@ -288,18 +263,16 @@ class NodeInProcess:
 
     def _wait(self, holds: Callable[[], object], what: str, timeout_s: float = WAIT_S) -> None:
         deadline = time.monotonic() + timeout_s
-        with self._changed:
-            while True:
-                if self._error is not None:
-                    error, self._error = self._error, None
-                    self._closed = True
-                    raise error
-                if holds():
-                    return
-                left_s = deadline - time.monotonic()
-                if left_s <= 0:
-                    raise TimeoutError(f"{what} within {timeout_s:g} s")
-                self._changed.wait(min(left_s, _LOOK_S))
+        while True:
+            if self._error is not None:
+                error, self._error = self._error, None
+                self._closed = True
+                raise error
+            if holds():
+                return
+            if time.monotonic() >= deadline:
+                raise TimeoutError(f"{what} within {timeout_s:g} s")
+            time.sleep(_LOOK_S)
 
     def close(self) -> None:
         """Shut the node down and leave the graph; raises what a callback raised meanwhile."""
@@ -325,5 +298,4 @@ class NodeInProcess:
                 context.destroy()
 
 
-_LOOK_S = 0.02
-"""How often a match or an answer is looked at, of which no event notifies."""
+_LOOK_S = 0.005

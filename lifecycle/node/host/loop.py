@@ -1,8 +1,5 @@
 """Spin the nodes of one process, shut them down within a bound, and detect hanging callbacks.
 
-Owns: the executor's thread, signals, and the bounded way down (shutdown transitions, then leaving
-DDS), in a host and in a terminal alike; and what counts as hanging.
-
 rclpy's own signal handlers are not used: they end the context while the nodes still need it, and
 nothing could be reported or done after that.
 
@@ -31,7 +28,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.executors import (
-    ExternalShutdownException,
     MultiThreadedExecutor,
     ShutdownException,
 )
@@ -53,22 +49,13 @@ if TYPE_CHECKING:
 
 
 class Watchdog:
-    """Keeps the busy sign of one executor; called in its thread only.
-
-    Args:
-        sign: this process's side.
-        on_overlong: called with the seconds that a callback took which returned after all.
-    """
+    """Keeps the busy sign of one executor; called in its thread only."""
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
         self._sign = sign
         self._on_overlong = on_overlong
         self._running = False
         self._changing: set[str] = set()
-
-    def add(self, hosted: Hosted) -> None:
-        """Leave the transitions of a node to their own deadlines."""
-        hosted.add_listener(self._follow)
 
     def begin(self, entity: Any) -> None:
         """Note that a callback begins, and of what it is; None for a task."""
@@ -81,7 +68,7 @@ class Watchdog:
         self._running = False
         self._idle()
 
-    def _follow(self, hosted: Hosted) -> None:
+    def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends, inside a callback as everything does."""
         name = hosted.full_name
         if not hosted.reported.steady:
@@ -104,10 +91,6 @@ class Heartbeat:
     It is in the node's default callback group: it comes late by as long as another callback of that
     group takes, or as all threads are busy. Callbacks of other groups may take as long as they like
     while a thread is left.
-
-    Args:
-        sign: this process's side.
-        on_overlong: called with the seconds that a beat came late by, beyond the limit.
     """
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
@@ -120,10 +103,6 @@ class Heartbeat:
         self._changing: set[str] = set()
         self._runs = False
         sign.speak_for_process()
-
-    def add(self, hosted: Hosted) -> None:
-        """Leave the transitions of a node to their own deadlines."""
-        hosted.add_listener(self._follow)
 
     def run(self, *, runs: bool) -> None:
         """Watch from now on, as the executor runs, or nothing any more."""
@@ -159,7 +138,7 @@ class Heartbeat:
         if late_s >= self._sign.limit_s:
             self._on_overlong(late_s)
 
-    def _follow(self, hosted: Hosted) -> None:
+    def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends: meanwhile nothing else of its group runs."""
         with self._lock:
             if not hosted.reported.steady:
@@ -200,14 +179,6 @@ class NodeLoop:
 
     Attributes:
         watching: events that this loop waits for, whatever runs the callbacks of nodes.
-
-    Example:
-        >>> loop = NodeLoop(context)
-        >>> camera = Camera()
-        >>> loop.add(camera.lifecycle)
-        >>> ending = lambda number: loop.stop(f"signal {number}", code=0)
-        >>> with on_signal(ending):
-        ...     loop.spin_and_exit()
     """
 
     def __init__(
@@ -249,7 +220,7 @@ class NodeLoop:
         self._hosted.append(hosted)
         for each in (self._watchdog, self._heartbeat):
             if each is not None:
-                each.add(hosted)
+                hosted.listeners.append(each.follow)  # transitions have deadlines of their own
         if isinstance(hosted, Managed):
             self.spin(hosted.node)
 
@@ -303,9 +274,8 @@ class NodeLoop:
         )
         if self._heartbeat is not None:
             self._heartbeat.run(runs=False)
-        guard = threading.Thread(
-            target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
-        )
+        guard = threading.Timer(bound_s, self._give_up, (bound_s, reason))
+        guard.daemon = True
         # At the limit of threads it goes without: a supervisor ends what does not end by itself.
         with contextlib.suppress(RuntimeError):
             guard.start()
@@ -321,16 +291,11 @@ class NodeLoop:
             last: is called once no callback runs any more.
         """
         if self._own is not self._executor:
-            threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
+            spin = functools.partial(self._own.spin_once, _SPIN_S)
+            threading.Thread(target=self._spin, args=(spin,), name="executor", daemon=True).start()
             if self._heartbeat is not None:
                 self._heartbeat.run(runs=True)
-        while not self._done:
-            try:
-                self.turn()
-            except ShutdownException:  # noqa: PERF203
-                pass
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
-                self._failed(error)
+        self._spin(self.turn)
         self.close()
         contexts = dict.fromkeys([self._context, *(node.context for node in self.nodes)])
         last()
@@ -361,21 +326,20 @@ class NodeLoop:
             self._own.shutdown(_LEAVE_S)
         self._executor.shutdown()
 
-    def _spin_own(self) -> None:
-        """Run the executor of nodes in this thread until it is shut down."""
+    def _spin(self, once: Callable[[], None]) -> None:
+        """Run callbacks in this thread until all is done."""
         while not self._done:
             try:
-                self._own.spin_once(_SPIN_S)
-            except (ShutdownException, ExternalShutdownException):  # noqa: PERF203
+                once()
+            except ShutdownException:  # noqa: PERF203
                 return
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code: reported
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
                 self._failed(error)
-                if not self._context.ok():
-                    return
 
     def _failed(self, error: Exception | SystemExit) -> None:
         if not self._context.ok():
-            sys.stderr.write("rclpy was shut down by a node's own code: its process ends\n")
+            if not self._done:
+                sys.stderr.write("rclpy was shut down by a node's own code: its process ends\n")
             self._done = True  # no transition can be run without it
             return
         if isinstance(error, SystemExit):
@@ -401,7 +365,6 @@ class NodeLoop:
 
     def _give_up(self, bound_s: float, reason: str) -> None:
         """End the process when a blocking callback keeps the executor from doing so."""
-        threading.Event().wait(bound_s)
         names = ", ".join(node.get_fully_qualified_name() for node in self.nodes)
         sys.stderr.write(
             f"cannot shut down {names} within {bound_s:g} s after {reason}: "
@@ -424,12 +387,10 @@ def _executor(kind: Executor, threads: int, context: Context) -> Any:
     return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
-_NONE: Mapping[int, Callable[[], bool]] = {}
-
-
 @contextlib.contextmanager
 def on_signal(
-    handler: Callable[[signal.Signals], None], beside: Mapping[int, Callable[[], bool]] = _NONE
+    handler: Callable[[signal.Signals], None],
+    beside: Mapping[int, Callable[[], bool]],
 ) -> Iterator[None]:
     """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
 

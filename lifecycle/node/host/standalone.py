@@ -1,18 +1,13 @@
 """Run one node in a terminal, without a supervisor: with a manifest's part of a plan, or without.
 
-Owns: what happens between the shell and the node: rclpy.init with the command line's --ros-args,
-the drive up in auto mode, one printed line per change of state, the way out; and what such a node
-reports of its liveliness, which a supervisor that attaches to it still sees.
-
-DDS asserts that its process runs; that its executor hangs is noticed by a thread of its own, which
-sleeps until then. A callback that also holds the lock of the interpreter keeps that thread from
-reporting, and only a supervisor of its own would see.
+To a supervisor that attaches to it DDS asserts that its process runs; that its executor hangs is
+noticed by a thread of its own, which sleeps until then. A callback that also holds the lock of the
+interpreter keeps that thread from reporting, and only a supervisor of its own would see.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import signal
 import sys
@@ -35,7 +30,7 @@ from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import Mode, parse_mode
+from lifecycle.node.author.spec import is_auto
 from lifecycle.node.host.adoption import Adoption, Hosted
 from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.lifecycle.steps import CallbackOutcome
@@ -47,14 +42,7 @@ _REPEATED_AFTER_S = (0.1, 0.3)
 
 @typing.final
 class OwnLiveliness:
-    """The liveliness of one process without a supervisor.
-
-    Args:
-        limit_s: seconds, > 0, that a callback may take.
-
-    Attributes:
-        sign: for the loop that spins the node.
-    """
+    """The liveliness of one process without a supervisor; its sign is for what spins the node."""
 
     def __init__(self, limit_s: float) -> None:
         self.sign = BusySign.make(limit_s)
@@ -65,12 +53,7 @@ class OwnLiveliness:
         self._name = ""
 
     def open(self, hosted: Managed, republish_names: Callable[[], None]) -> None:
-        """Assert its liveliness from now on.
-
-        Args:
-            hosted: whose name it has.
-            republish_names: called when a subscriber is matched, which may have dropped the names.
-        """
+        """Assert its liveliness from now on; a subscriber that is matched may have lost names."""
         self._name = hosted.full_name
         self._publisher = AlivePublisher(
             hosted.node, node_alive_topic(self._name), on_listener=republish_names
@@ -95,20 +78,20 @@ class OwnLiveliness:
             time.sleep(again_s)
 
     def announce(self, why: str) -> None:
-        """Say why it is silent; nothing takes that back."""
-        with self._lock:
-            silent = self._silent = {self._name: why} if why else {}
-        self._publish(silent)
-        for again_s in _REPEATED_AFTER_S:
-            timer = threading.Timer(again_s, self._publish, (silent,))
+        """Say why it is silent, or that it is not any more."""
+        silent = self._silent = {self._name: why} if why else {}
+
+        def publish() -> None:
+            with self._lock:
+                # Only what still holds is said again.
+                if silent is self._silent and self._publisher is not None:
+                    self._publisher.notify(AliveNotice(silent=silent))
+
+        publish()
+        for after_s in _REPEATED_AFTER_S:
+            timer = threading.Timer(after_s, publish)
             timer.daemon = True
             timer.start()
-
-    def _publish(self, silent: dict[str, str]) -> None:
-        with self._lock:
-            # Only what still holds is said again.
-            if silent is self._silent and self._publisher is not None:
-                self._publisher.notify(AliveNotice(silent=silent))
 
 
 def run(
@@ -118,7 +101,6 @@ def run(
     spec: PlannedNode | None = None,
     domain_id: int | None = None,
     arguments: list[str] | None = None,
-    say: Callable[[str], None] | None = None,
     interrupted: ExitCode = ExitCode.OK,
 ) -> NoReturn:
     """Run a node until Ctrl-C or SIGTERM, shut it down, and end the process; never returns.
@@ -135,15 +117,13 @@ def run(
         spec: the node's part of a plan; None for a node that declares its endpoints in code.
         domain_id: 0–232; None takes ROS_DOMAIN_ID, else 0.
         arguments: command line with --ros-args; None takes the process's own.
-        say: called with each step; None prints to standard output.
         interrupted: exit code after Ctrl-C; OK as for other ROS nodes, since launch calls a node
             that exits otherwise died.
 
     Exit codes: 0 after SIGTERM, `interrupted` after Ctrl-C, 1 when a callback raised an exception,
     6 when the node could not be brought up.
     """
-    report = functools.partial(_report_line, say or _print)
-    mode = parse_mode(lifecycle) if lifecycle is not None else None
+    auto = lifecycle is not None and is_auto(lifecycle)
     settings = ParticipantSettings() if spec is None else ParticipantSettings.of(spec)
     with discovery_by_profile(settings):
         rclpy.init(
@@ -162,8 +142,13 @@ def run(
         executor=planned.executor,
         threads=planned.threads,
     )
-    with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
-        adoption = Adoption(context, loop, mode=mode, use_global_arguments=True)
+
+    def end(number: signal.Signals) -> None:
+        report(f"{number.name}: shutting down")
+        loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
+
+    with on_signal(end, {}):
+        adoption = Adoption(context, loop, use_global_arguments=True)
         hosted: Hosted
         if spec is None:
             hosted = adoption.make_unplanned(node_class)
@@ -173,19 +158,17 @@ def run(
         loop.add(hosted)
         if isinstance(hosted, Managed):
             liveliness.open(hosted, loop.republish_names)
-        hosted.add_listener(lambda _: report(f"{name}: {_state(hosted)}"))
+        hosted.listeners.append(lambda _: report(f"{name}: {_state(hosted)}"))
         report(f"{name}: {_state(hosted)}")
-        if isinstance(hosted, Managed):
-            drives_itself = hosted.mode is Mode.AUTO
-        else:
-            drives_itself = mode is Mode.AUTO and hosted.spec.managed
-        if drives_itself:
-            loop.call_soon(_bring_up, hosted, loop, report)
+        if lifecycle is None:
+            auto = isinstance(hosted, Managed) and hosted.auto
+        if auto and hosted.spec.managed:
+            loop.call_soon(_bring_up, hosted, loop)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")
 
 
-async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None]) -> None:
+async def _bring_up(hosted: Hosted, loop: NodeLoop) -> None:
     name = hosted.full_name
     try:
         result = await hosted.bring_up()
@@ -199,24 +182,13 @@ async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None
     loop.stop("a failed bring-up", code=ExitCode.BRING_UP_FAILED)
 
 
-def _on_signal(
-    number: signal.Signals, loop: NodeLoop, report: Callable[[str], None], interrupted: ExitCode
-) -> None:
-    report(f"{number.name}: shutting down")
-    loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
-
-
 def _state(hosted: Hosted) -> str:
     if isinstance(hosted, Managed):
         return hosted.state.value
     return hosted.reported.label or "running"
 
 
-def _report_line(say: Callable[[str], None], line: str) -> None:
-    """Print `line` if it is still read: a closed pipe does not end a node."""
+def report(line: str) -> None:
+    """Print a line if it is still read: a closed pipe does not end a node."""
     with contextlib.suppress(BrokenPipeError):
-        say(line)
-
-
-def _print(line: str) -> None:
-    print(line, flush=True)
+        print(line, flush=True)

@@ -1,6 +1,6 @@
 """The gate: publishers, subscriptions and timers work only while their node is active.
 
-Owns: what "gated" means for each kind of entity. A gate swaps a method instead of asking a
+A gate swaps a method instead of asking a
 question: while the node is active `publisher.publish` *is* rclpy's own method, so an open gate
 costs nothing per call, and a closed one less than any publish. Entities that tools rely on
 (`/rosout`, `/parameter_events`, `~/transition_event`, `/clock`) never pass through here.
@@ -43,70 +43,57 @@ class Gated(Protocol):
 
 
 class NodeGate:
-    """All gated entities of one node; closed until the node is active."""
+    """All gated entities of one node; closed until the node is active.
 
-    def __init__(self) -> None:
-        self._apart: frozenset[str] = frozenset()
-        self._counts = True
+    Args:
+        counts: callbacks of subscriptions get message info, as `executor: events` has it not.
+
+    Attributes:
+        counts: as given.
+        is_open: data may flow.
+        apart: topics that are published by another host's clock.
+    """
+
+    def __init__(self, *, counts: bool = True) -> None:
+        self.counts = counts
+        self.is_open = False
+        self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
-        self._workers: dict[int, Gated] = {}
-        self._is_open = False
+        self._workers: dict[int, Callable[[], None]] = {}
         self._opened_ns = 0
-
-    @property
-    def is_open(self) -> bool:
-        """Data may flow."""
-        return self._is_open
 
     def add(self, entity: object, gated: Gated) -> None:
         """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
-        if isinstance(gated, CountedSubscription) and not self._counts:
-            gated.count_nothing()
-        if self._is_open:
-            self._open(gated)
-        else:
-            gated.close()
+        (gated.open if self.is_open else gated.close)()
 
-    def add_worker(self, entity: object, worker: Gated) -> None:
-        """Put `worker` in charge of `entity`; it is closed first: its last messages pass."""
-        self._workers[id(entity)] = worker
+    def add_worker(self, entity: object, stop: Callable[[], None]) -> None:
+        """Have `stop` called at removal, and before anything is closed: its last messages pass."""
+        self._workers[id(entity)] = stop
 
     def remove(self, entity: object) -> None:
         """Forget an entity that is being destroyed."""
         self._entities.pop(id(entity), None)
-        self._workers.pop(id(entity), None)
-
-    def count_nothing(self) -> None:
-        """Leave callbacks as they are: `executor: events` gives them no message info.
-
-        Raises:
-            LifecycleError: one takes it.
-        """
-        self._counts = False
-        for gated in tuple(self._entities.values()):
-            if isinstance(gated, CountedSubscription):
-                gated.count_nothing()
-                (gated.open if self._is_open else gated.close)()
+        if (stop := self._workers.pop(id(entity), None)) is not None:
+            stop()
 
     def measure(self, apart: Collection[str]) -> None:
-        """Count what arrives from now on by these clocks.
+        """Count what arrives from now on; `apart`: what is published by another host's clock."""
+        self.apart = apart
+        for gated in self._counted if self.is_open else ():
+            gated.open()
 
-        Args:
-            apart: topics that are published by another host's clock.
-        """
-        self._apart = frozenset(apart)
-        for gated in tuple(self._entities.values()):
-            if self._is_open and isinstance(gated, CountedSubscription):
-                self._open(gated)
+    @property
+    def _counted(self) -> list[CountedSubscription]:
+        entities = tuple(self._entities.values())
+        return [each for each in entities if isinstance(each, CountedSubscription)]
 
     def measured(self) -> Measured | None:
         """Return what subscriptions have counted; None while it is closed. From any thread."""
-        if not self._is_open:
+        if not self.is_open:
             return None
         now_ns = time.monotonic_ns()
-        entities = tuple(self._entities.values())
-        counts = (each.sample(now_ns) for each in entities if isinstance(each, CountedSubscription))
+        counts = (each.sample(now_ns) for each in self._counted)
         return Measured(
             active_s=(now_ns - self._opened_ns) / 1e9,
             samples=tuple(each for each in counts if each is not None),
@@ -114,19 +101,16 @@ class NodeGate:
 
     def open(self) -> None:
         """Open every entity; the node became active."""
-        self._is_open, self._opened_ns = True, time.monotonic_ns()
+        self.is_open, self._opened_ns = True, time.monotonic_ns()
         for gated in tuple(self._entities.values()):
-            self._open(gated)
-
-    def _open(self, gated: Gated) -> None:
-        if isinstance(gated, CountedSubscription):
-            gated.is_apart = gated.topic in self._apart
-        gated.open()
+            gated.open()
 
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
-        self._is_open = False
-        for gated in (*self._workers.values(), *self._entities.values()):
+        self.is_open = False
+        for stop in tuple(self._workers.values()):
+            stop()
+        for gated in tuple(self._entities.values()):
             gated.close()
 
 
@@ -162,56 +146,44 @@ class CountedSubscription:
     rclpy decides by the callback's signature, once per message, whether to pass the message info. A
     callback of ours takes it always, so that a swap between take and call changes nothing.
 
-    Attributes:
-        topic: fully qualified.
-        is_apart: it is published by another host's clock.
-        counts: callbacks get the message info.
+    Raises:
+        LifecycleError: its callback takes message info, and its node's gate counts nothing.
     """
 
-    def __init__(self, subscription: Subscription) -> None:
+    def __init__(self, subscription: Subscription, gate: NodeGate) -> None:
         self._subscription = subscription
-        self.topic = str(subscription.topic_name)
-        self.is_apart = False
-        self.counts = True
-        self._users = subscription.callback
-        self._is_open = False
-        self._call = _taking_info(subscription.callback)
+        self._topic = str(subscription.topic_name)
+        self._gate = gate
+        self._call = subscription.callback
         self._counter: Counter | None = None
+        takes_one = _takes_one(self._call)
+        if not gate.counts and not takes_one:
+            raise LifecycleError(
+                f"cannot give the callback of {self._topic!r} message info with 'executor: events'",
+                hint="have it take the message alone, or choose another executor",
+            )
+        if gate.counts and takes_one:
+            self._call = _taking_info(self._call)
 
     def open(self) -> None:
         """Count from now on."""
-        self._is_open = True
-        if not self.counts:
-            self._counter = None
-            self._subscription.callback = self._users
-        elif self._counter is None or self._counter.is_apart is not self.is_apart:
+        is_apart = self._topic in self._gate.apart
+        if not self._gate.counts:
+            self._subscription.callback = self._call
+        elif self._counter is None or self._counter.is_apart is not is_apart:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-            self._counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
+            self._counter = Counter(now_ns, wall_ns, is_apart=is_apart)
             self._subscription.callback = counting(self._call, self._counter)
 
     def close(self) -> None:
         """Count no more."""
-        self._is_open = False
         self._counter = None
-        self._subscription.callback = self._call if self.counts else self._users
-
-    def count_nothing(self) -> None:
-        """Leave the callback as it is.
-
-        Raises:
-            LifecycleError: it takes message info, which rclpy's events executor has not.
-        """
-        if not _takes_one(self._users):
-            raise LifecycleError(
-                f"cannot give the callback of {self.topic!r} message info with 'executor: events'",
-                hint="have it take the message alone, or choose another executor",
-            )
-        self.counts = False
+        self._subscription.callback = self._call
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""
         counter = self._counter
-        return None if counter is None else (self.topic, counter.sample(now_ns))
+        return None if counter is None else (self._topic, counter.sample(now_ns))
 
 
 class GatedSubscription(CountedSubscription):
@@ -221,12 +193,12 @@ class GatedSubscription(CountedSubscription):
     once. So the last `depth` of those are kept while closed and given to the callback when opened.
     """
 
-    def __init__(self, subscription: Subscription, later: Later) -> None:
-        super().__init__(subscription)
+    def __init__(self, subscription: Subscription, gate: NodeGate, later: Later) -> None:
+        super().__init__(subscription, gate)
         self._later = later
         qos = subscription.qos_profile
         self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
-        self._kept: collections.deque[tuple[object, Info]] = collections.deque(
+        self._kept: collections.deque[tuple[object, ...]] = collections.deque(
             maxlen=qos.depth or None
         )
 
@@ -239,28 +211,25 @@ class GatedSubscription(CountedSubscription):
     def close(self) -> None:
         """Drop messages."""
         super().close()
-        alone = not self.counts and _takes_one(self._users)
-        self._subscription.callback = self._drop_alone if alone else self._drop
-
-    def _drop_alone(self, message: object) -> None:
-        self._drop(message, {})
+        self._subscription.callback = self._drop if self._gate.counts else self._keep
 
     def _drop(self, message: object, info: Info) -> None:
+        self._keep(message, info)
+
+    def _keep(self, message: object, *info: Info) -> None:
         if self._keeps:
-            self._kept.append((message, info))
+            self._kept.append((message, *info))
 
     async def _deliver(self) -> None:
         # Closed again before this ran: then what was kept stays kept.
-        while self._kept and self._is_open:
+        while self._kept and self._gate.is_open:
             returned = self._call(*self._kept.popleft())
             if inspect.isawaitable(returned):
                 await returned
 
 
 def _taking_info(callback: Callable[..., Any]) -> Callable[[Any, Info], Any]:
-    """Return a callback that takes message and info, whatever the user's takes."""
-    if not _takes_one(callback):
-        return callback
+    """Return a callback that takes message and info of one that takes the message alone."""
     if inspect.iscoroutinefunction(callback):
 
         async def awaited(message: object, _: Info) -> None:

@@ -1,9 +1,8 @@
 """Health of a node: its author's `health` method, asked at an interval, and what it last returned.
 
-Owns: `HealthCheck`: when the method is asked (from when the node is connected, at once after each
-change of state, then every `interval_s`), its deadline, and how an answer becomes a `HealthReport`,
-which is part of the node's configuration. What must be healthy, and what follows if it is not, is
-the manifest's matter (lifecycle.verify).
+It is asked from when the node is connected, at once after each change of state, then every
+`interval_s`. What must be healthy, and what follows if it is not, is the manifest's matter
+(lifecycle.verify).
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import inspect
 import time
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.manifest.model import Health
@@ -19,8 +18,6 @@ from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.verify.observation import HealthReport
 
 if TYPE_CHECKING:
-    from rclpy.timer import Timer
-
     from lifecycle.node.lifecycle.services import Turns
 
 _LONGEST = 200
@@ -31,20 +28,19 @@ class HealthCheck:
     """Asks one node how it is.
 
     Args:
-        check: returns None, True or "" if all is well, else what is wrong; may be async. None for a
-            node without one.
+        check: returns None, True or "" if all is well, else what is wrong; may be async.
         turns: has it asked in the node's executor.
         how: interval and deadline.
         changed: called whenever `report` is another one, or the first in another state.
         failed: logs a traceback.
 
     Attributes:
-        report: the last answer; None while the node is not connected, or has no check.
+        report: the last answer; None while the node is not connected.
     """
 
     def __init__(
         self,
-        check: Callable[[], Any] | None,
+        check: Callable[[], Any],
         turns: Turns,
         how: Health,
         *,
@@ -56,7 +52,7 @@ class HealthCheck:
         self._how = how
         self._changed = changed
         self._failed = failed
-        self._timer: Timer | None = None
+        self._end: Callable[[], None] | None = None
         self._asked_s: float | None = None
         self._round = 0
         self._is_stale = False
@@ -64,27 +60,21 @@ class HealthCheck:
 
     def follow(self, state: NodeState) -> None:
         """Begin to ask, ask again or stop, as the node's new state says."""
-        if self._check is None or not state.steady:
+        if not state.steady:
             return
-        if not state.connected:
-            self._stop()
-            return
-        if self._timer is None:
-            self._timer = self._turns.timer(self._how.interval_s, self._ask)
         self._asked_s = None  # what it says of the state before counts no more
-        self._is_stale = True
         self._round += 1
+        if not state.connected:
+            if self._end is not None:
+                self._end()
+            self._end = self.report = None
+            return
+        if self._end is None:
+            self._end = self._turns.call_every(self._how.interval_s, self._ask)
+        self._is_stale = True
         self._ask()
 
-    def _stop(self) -> None:
-        if self._timer is not None:
-            self._turns.end(self._timer)
-            self._timer = None
-        self._round += 1
-        self._asked_s = self.report = None
-
     def _ask(self) -> None:
-        assert self._check is not None
         if self._asked_s is not None:
             waited_s = time.monotonic() - self._asked_s
             if waited_s >= self._how.timeout_s:
@@ -105,18 +95,15 @@ class HealthCheck:
         round_ = self._round
 
         async def wait() -> None:
-            report = await self._awaited(answer)
+            try:
+                report = _report(await answer)
+            except Exception as error:  # noqa: BLE001 - the user's code: reported
+                report = self._raised(error)
             if round_ == self._round:
                 self._asked_s = None
                 self._take(report)
 
         self._turns.call_soon(wait)
-
-    async def _awaited(self, answer: Awaitable[Any]) -> HealthReport:
-        try:
-            return _report(await answer)
-        except Exception as error:  # noqa: BLE001 - the user's code: reported
-            return self._raised(error)
 
     def _raised(self, error: Exception) -> HealthReport:
         said = f"it raised {type(error).__name__}: {error}"[:_LONGEST]

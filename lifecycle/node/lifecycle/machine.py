@@ -1,9 +1,8 @@
 """The state machine of a node: one table of states and transitions, and what runs in each.
 
-Owns: states, transitions, their ids and labels (lifecycle_msgs/State, lifecycle_msgs/Transition,
-rcl_lifecycle's default_state_machine.c), with connect nested inside inactive; and `Machine`, which
-holds a node's state and runs its steps: whatever happens to a node happens in a row of `TABLE`, or
-in the author's callback between two of them. Knows no rclpy.
+States, transitions, their ids and labels are those of lifecycle_msgs and of rcl_lifecycle's
+default_state_machine.c, with connect nested inside inactive. Whatever happens to a node happens in
+a row of `TABLE`, or in the author's callback between two of them. Knows no rclpy.
 
 A transition has two halves, as in rcl: a *request* moves a primary state into a transition state
 (`unconfigured` → `configuring`), and the callback's *outcome* moves it on. The data layer
@@ -29,7 +28,6 @@ from lifecycle.node.lifecycle import steps
 from lifecycle.node.lifecycle.steps import (
     SUCCESS,
     CallbackOutcome,
-    CancelledError,
     DeadlineError,
     Result,
     Running,
@@ -254,19 +252,6 @@ TRANSITION_GRAPH = tuple(_BY_ID[each] for each in dict.fromkeys(row.id for row i
 """In the order in which rcl_lifecycle answers get_transition_graph; connect and disconnect last."""
 
 
-class StateChange(msgspec.Struct, frozen=True, kw_only=True):
-    """One change of the machine.
-
-    Attributes:
-        event: the edge that other tools must receive as a lifecycle_msgs/TransitionEvent; None
-            for a change inside one of their states.
-    """
-
-    start: NodeState
-    goal: NodeState
-    event: Transition | None
-
-
 class RefusedError(LifecycleError):
     """A request that is not allowed in this state; the node lives on unchanged."""
 
@@ -283,11 +268,6 @@ class Machine:
     Attributes:
         state: the current state, written by `transitions` alone.
         is_permitted: the request that is looked at comes through the supervisor's gate.
-
-    Example:
-        >>> result = await machine.change(TransitionRequest.CONFIGURE)
-        >>> result.outcome, machine.state.value
-        (<CallbackOutcome.SUCCESS: 'transition_success'>, 'inactive/disconnected')
     """
 
     def __init__(self, node: Any, timeouts: Timeouts, table: Iterable[Row] = TABLE) -> None:
@@ -378,8 +358,9 @@ class Machine:
         A running async callback is cancelled first; each step keeps its own deadline.
         """
         if not self.state.steady:
-            self._interrupt(CancelledError(f"cannot go on with {self._what}: {reason}"))
-            await _Steady(self)
+            self._interrupt(LifecycleError(f"cannot go on with {self._what}: {reason}"))
+            while not self.state.steady:
+                await _NextTurn()
         if self.state is NodeState.FINALIZED:
             return SUCCESS
         return await self.change(TransitionRequest.SHUTDOWN)
@@ -422,25 +403,14 @@ class Machine:
         deadline_s: float = getattr(self._timeouts, limit)
         what = f"{self._node.full_name}: {name}"
         late = DeadlineError(f"cannot finish {what} within its deadline of {deadline_s:g} s")
-        call_off: list[Callable[[], None]] = []
-
-        def started(running: Running) -> None:
-            self._running = running
-            self._what = what
-            call_off.append(self._node.turns.call_after(deadline_s, lambda: self._interrupt(late)))
-
+        running = Running(steps.called(self._node.callback(name), argument))
+        self._running, self._what = running, what
+        call_off = self._node.turns.call_after(deadline_s, lambda: self._interrupt(late))
         try:
-            return await steps.call(
-                self._node.callback(name),
-                (argument,),
-                what=what,
-                deadline_s=deadline_s,
-                started=started,
-            )
+            return await steps.result_of(running, what=what, deadline_s=deadline_s)
         finally:
             self._running = None
-            for each in call_off:
-                each()
+            call_off()
 
     def _interrupt(self, error: LifecycleError) -> None:
         """Stop the author's callback that runs; its task is resumed for the last time."""
@@ -464,15 +434,11 @@ class Machine:
         if start != goal or (row.id and row.trigger == _OK):
             # An error inside connect leaves inactive by no edge of rcl's.
             event = _BY_ID.get(row.id, Transition(id=0, label="", start=start, goal=goal))
-        self._node.changed(StateChange(start=row.source, goal=row.goal, event=event))
+        self._node.changed(row.goal, event)
 
 
-class _Steady:
-    """Awaits the end of the running transition; looked at each time the executor wakes."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
+class _NextTurn:
+    """Awaits that the executor wakes again."""
 
     def __await__(self) -> Generator[None, None, None]:
-        while not self._machine.state.steady:
-            yield
+        yield

@@ -1,10 +1,8 @@
 """Run the author's callbacks, sync or async, inside rclpy's executor.
 
-Owns: `Running`, by which an author's coroutine is stopped where it awaits; and how a callback's
-return value or exception becomes an outcome. An `async def` callback that exceeds its deadline gets
-`DeadlineError` thrown in, so that its traceback shows what it was waiting for. A sync callback
-cannot be interrupted in Python: it is judged when it returns, and a supervisor that lost patience
-ends the process.
+An `async def` callback that exceeds its deadline gets `DeadlineError` thrown in, so that its
+traceback shows what it was waiting for. A sync callback cannot be interrupted in Python: it is
+judged when it returns, and a supervisor that lost patience ends the process.
 """
 
 from __future__ import annotations
@@ -34,10 +32,6 @@ class DeadlineError(LifecycleError):
     """A transition callback took longer than its deadline."""
 
 
-class CancelledError(LifecycleError):
-    """A running transition was cancelled because its process must end."""
-
-
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a step.
 
@@ -64,9 +58,9 @@ class Running:
 
     Attributes:
         returned: what it returned.
-        failure: what it raised; None if it did not.
-        trace: of the failure.
+        failure: what it raised, whose traceback is `trace`; None if it did not.
         interruption: why it was stopped; None if it was not.
+        awaits: it has awaited something: only there it can be stopped.
         done: it works no longer.
     """
 
@@ -74,6 +68,7 @@ class Running:
         self._coroutine = coroutine
         self._lock = threading.Lock()
         self._thread = 0
+        self.awaits = False
         self.done = False
         self.returned: Any = None
         self.failure: Exception | None = None
@@ -85,6 +80,7 @@ class Running:
             with self._lock:
                 yielded = self._step()
             if not self.done:
+                self.awaits = True
                 yield yielded
 
     def interrupt(self, error: LifecycleError) -> bool:
@@ -138,44 +134,33 @@ class Running:
         self.failure, self.trace, self.done = error, traceback.format_exc(), True
 
 
-async def call(
-    callback: Callable[..., Any],
-    arguments: tuple[object, ...],
-    *,
-    what: str,
-    deadline_s: float,
-    started: Callable[[Running], None],
-) -> Result:
+async def called(callback: Callable[..., Any], *arguments: object) -> Any:
+    """Call what is sync or async, and may take fewer arguments than are given."""
+    returned = callback(*arguments[: positional_count(callback, len(arguments))])
+    return await returned if inspect.isawaitable(returned) else returned
+
+
+async def result_of(running: Running, *, what: str, deadline_s: float) -> Result:
     """Run a transition callback and return its result; never raises for what the user did.
 
     Args:
-        callback: sync or async; may take fewer arguments than given (`on_configure(self)`).
-        arguments: what the callback may take.
+        running: it; whoever awaits this interrupts it at its deadline, where it awaits.
         what: for messages, "/camera: on_configure".
-        deadline_s: seconds, > 0; of a sync callback. An async one is interrupted by the caller.
-        started: called before an async callback first runs.
+        deadline_s: seconds, > 0.
     """
     began = time.monotonic()
-    try:
-        returned = callback(*arguments[: positional_count(callback, len(arguments))])
-    except Exception as error:  # noqa: BLE001 - the user's code: reported, then ERROR
-        return _raised(error, traceback.format_exc(), what=what)
+    await running
     took_s = time.monotonic() - began
-    if inspect.isawaitable(returned):
-        running = Running(awaiting(returned))
-        started(running)
-        await running
-        failure = running.failure or running.interruption
-        if failure is not None:
-            return _raised(failure, running.trace, what=what)
-        returned = running.returned
-    elif took_s >= deadline_s:
+    failure = running.failure or (running.interruption if running.awaits else None)
+    if failure is not None:
+        return _raised(failure, running.trace, what=what)
+    if took_s >= deadline_s and not running.awaits:
         return Result(
             outcome=CallbackOutcome.ERROR,
             error=f"cannot accept {what}: it blocked for {took_s:.1f} s, its deadline is "
             f"{deadline_s:g} s; make it `async def` so that it can be interrupted",
         )
-    return judge(returned, what=what)
+    return judge(running.returned, what=what)
 
 
 def _raised(error: Exception, trace: str, *, what: str) -> Result:
@@ -238,8 +223,3 @@ def positional_count(callback: Callable[..., Any], available: int) -> int:
         inspect.Parameter.POSITIONAL_OR_KEYWORD,
     }
     return min(available, sum(kind in positional for kind in kinds))
-
-
-async def awaiting(awaitable: Any) -> Any:
-    """Await what a callback of the author's has returned, a coroutine or a future."""
-    return await awaitable

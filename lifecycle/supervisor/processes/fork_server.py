@@ -203,7 +203,7 @@ class ForkServer:
             descriptors.append(control)
             fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in process.environment)
             if fresh or run.prefix or scoped:
-                host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
+                host = (sys.executable, "-m", _HOST, "{control}")
                 argv = (*scoped, *run.prefix, *host)
         self._next += 1
         message = ForkRequest(

@@ -42,12 +42,7 @@ class HostProcess:
         self.log = log
         with log.open("w", encoding="utf-8") as written, theirs:
             self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "lifecycle.node.host.host",
-                    f"--control-fd={theirs.fileno()}",
-                ],
+                [sys.executable, "-m", "lifecycle.node.host.host", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 cwd=HERE,
                 stdout=written,

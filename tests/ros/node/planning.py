@@ -11,8 +11,11 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, plan_without_manifest
+from lifecycle.node.author.spec import plan_without_manifest
+from lifecycle.node.host.adoption import Adoption, Participants
+from lifecycle.node.host.loop import NodeLoop
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from tests.builders import STRING, planned_endpoint
 
@@ -42,8 +45,23 @@ def planned(name: str, *endpoints: PlannedEndpoint, **changes: Any) -> PlannedNo
     return replace(blank, endpoints=endpoints, **{"events": False, **changes})
 
 
+class Present(Participants):
+    """The participant of a context that has one."""
+
+    @contextlib.contextmanager
+    def carrying(self, _: ParticipantSettings) -> Iterator[rclpy.Context]:
+        yield self._default
+
+
 @contextlib.contextmanager
 def built_with(spec: PlannedNode, context: rclpy.Context) -> Iterator[None]:
     """Construct the next node as a host would."""
-    with constructing(Construction(spec=spec, mode=Mode.MANUAL, context=context)):
-        yield
+    loop = NodeLoop(context)
+    adoption = Adoption(context, loop)
+    adoption.participants = Present(context)
+    try:
+        with adoption.expecting(spec, [spec]):
+            yield
+    finally:
+        adoption.unfollow()
+        loop.close()

@@ -265,7 +265,7 @@ def test_a_supervisor_that_goes_before_it_speaks_leaves_nothing(tmp_path: Path) 
     ours, theirs = socket.socketpair()
     with theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "lifecycle.node.host.host", f"--control-fd={theirs.fileno()}"],
+            [sys.executable, "-m", "lifecycle.node.host.host", str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
         )
     ours.close()

@@ -14,7 +14,8 @@ from lifecycle.node.lifecycle.steps import (
     DeadlineError,
     Result,
     Running,
-    call,
+    called,
+    result_of,
 )
 
 WHAT = "/camera: on_configure"
@@ -36,8 +37,8 @@ def drive(
     interruption: LifecycleError | None = None,
 ) -> Result:
     """Run a callback as an executor does: resume it at each turn; interrupt it after the first."""
-    begun: list[Running] = []
-    coroutine = call(callback, ("state",), what=WHAT, deadline_s=deadline_s, started=begun.append)
+    running = Running(called(callback, "state"))
+    coroutine = result_of(running, what=WHAT, deadline_s=deadline_s)
     for _ in range(turns):
         try:
             coroutine.send(None)
@@ -45,7 +46,7 @@ def drive(
             result: Result = stop.value
             return result
         if interruption is not None:
-            assert begun[0].interrupt(interruption)
+            assert running.interrupt(interruption)
     coroutine.close()
     raise AssertionError(f"still running after {turns} turns")
 
@@ -142,15 +143,14 @@ def test_a_callback_that_answers_its_interruption_has_not_succeeded() -> None:
 
 
 def test_a_callback_that_interrupts_itself_goes_on() -> None:
-    running: list[Running] = []
     refused: list[bool] = []
 
     async def on_configure() -> None:
-        refused.append(running[0].interrupt(LATE))
+        refused.append(running.interrupt(LATE))
 
-    ending = call(on_configure, (), what=WHAT, deadline_s=10.0, started=running.append)
+    running = Running(called(on_configure))
     with pytest.raises(StopIteration) as stop:
-        ending.send(None)
+        result_of(running, what=WHAT, deadline_s=10.0).send(None)
     assert stop.value.value.outcome is CallbackOutcome.SUCCESS
     assert refused == [False]
 

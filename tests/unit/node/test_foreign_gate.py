@@ -61,7 +61,7 @@ def _late() -> Any:
 def _node(activate: Any) -> ForeignNode:
     node = ForeignNode.__new__(ForeignNode)
     members: dict[str, Any] = {
-        "node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
+        "full_name": "/base",
         "gate": NodeGate(),
         "_machine": Machine(activate),
         "_is_constructed": True,
@@ -98,3 +98,18 @@ def test_one_that_succeeds_opens_it_and_a_second_changes_nothing() -> None:
         asyncio.run(node.change_for_supervisor("activate"))
     assert node.gate.is_open
     assert node.may_activate()
+
+
+def test_one_that_was_too_late_and_cannot_be_deactivated_leaves_it_closed() -> None:
+    node = _node(_late)
+    machine: Any = node._machine
+    change = machine.change
+
+    def refuse(operation: str) -> Any:
+        return _refuse() if operation == "deactivate" else change(operation)
+
+    machine.change = refuse
+    with pytest.raises(RefusedError):
+        asyncio.run(node.change_for_supervisor("activate"))
+    assert not node.gate.is_open
+    assert not node.may_activate()

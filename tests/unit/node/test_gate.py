@@ -87,7 +87,7 @@ def test_a_removed_entity_is_left_alone() -> None:
 
 def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> None:
     subscription = FakeSubscription(lambda message, info: None)
-    GatedSubscription(subscription, at_once).close()
+    GatedSubscription(subscription, NodeGate(), at_once).close()
     subscription.callback("message", INFO)
     with pytest.raises(TypeError):
         subscription.callback("message")
@@ -96,7 +96,7 @@ def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> 
 def test_what_arrives_while_open_is_counted_since_then() -> None:
     received: list[object] = []
     gate, subscription = NodeGate(), FakeSubscription(received.append)
-    gate.add(subscription, GatedSubscription(subscription, at_once))
+    gate.add(subscription, GatedSubscription(subscription, gate, at_once))
     assert gate.measured() is None
     gate.open()
     later_ns = time.time_ns() + 10**9
@@ -117,7 +117,7 @@ def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> 
     gate = NodeGate()
     subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL")
     tasks: list[Callable[[], Coroutine[Any, Any, None]]] = []
-    gate.add(subscription, GatedSubscription(subscription, tasks.append))
+    gate.add(subscription, GatedSubscription(subscription, gate, tasks.append))
     subscription.callback("map", INFO)
     gate.open()
     gate.close()

@@ -39,8 +39,10 @@ def test_an_override_without_the_decorator_still_handles() -> None:
     class Special(Base):
         def see(self, message: object) -> None: ...
 
-    handlers = match(Special, [SCAN, RESET, DOCK], node="/base")
-    assert handlers.bound(Special, SCAN) is Special.see
+    node = Special()
+    handlers, timers = match(node, [SCAN, RESET, DOCK], name="/base")
+    assert handlers[SCAN.kind, "scan"] == node.see
+    assert timers == [(node.tick, 0.5)]
 
 
 def test_one_method_may_handle_two_subscriptions() -> None:
@@ -51,8 +53,9 @@ def test_one_method_may_handle_two_subscriptions() -> None:
 
     front = planned_endpoint(EndpointKind.SUBSCRIPTION, "front")
     rear = planned_endpoint(EndpointKind.SUBSCRIPTION, "rear")
-    handlers = match(Both, [front, rear], node="/both")
-    assert [handlers.bound(Both, each) for each in (front, rear)] == [Both.see, Both.see]
+    node = Both()
+    handlers, _ = match(node, [front, rear], name="/both")
+    assert [handlers[each.kind, each.name] for each in (front, rear)] == [node.see, node.see]
 
 
 def test_a_handler_of_another_kind_does_not_count() -> None:
@@ -61,7 +64,7 @@ def test_a_handler_of_another_kind_does_not_count() -> None:
         def see(self, request: object, response: object) -> None: ...
 
     with pytest.raises(LifecycleError) as error:
-        match(Wrong, [SCAN], node="/base")
+        match(Wrong(), [SCAN], name="/base")
     assert str(error.value).splitlines() == [
         (
             "cannot use handler Wrong.see: @on_service('scan') names no service server that /base "
@@ -83,7 +86,7 @@ def test_two_handlers_for_one_subscription_are_an_error() -> None:
         def second(self, message: object) -> None: ...
 
     with pytest.raises(LifecycleError) as error:
-        match(Twice, [SCAN], node="/base")
+        match(Twice(), [SCAN], name="/base")
     assert str(error.value) == (
         "cannot handle subscription 'scan' of /base twice: Twice.first and Twice.second"
     )

@@ -20,7 +20,7 @@ OK = HealthReport(ok=True)
 class Bench:
     """A health check whose executor and clock are the test's."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, check: Callable[[], Any] | None) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, check: Callable[[], Any]) -> None:
         self.now_s = 0.0
         self.tasks: list[Callable[[], Any]] = []
         self.ticks: list[Callable[[], None]] = []
@@ -37,13 +37,10 @@ class Bench:
 
     # What it asks of its turns.
 
-    def timer(self, period_s: float, callback: Callable[[], None]) -> Callable[[], None]:
+    def call_every(self, period_s: float, callback: Callable[[], None]) -> Callable[[], None]:
         assert period_s == 2.0
         self.ticks.append(callback)
-        return callback
-
-    def end(self, timer: Callable[[], None]) -> None:
-        self.ticks.remove(timer)
+        return lambda: self.ticks.remove(callback)
 
     def call_soon(self, task: Callable[[], Any]) -> bool:
         self.tasks.append(task)
@@ -114,9 +111,3 @@ def test_an_async_one_is_not_known_once_it_is_late_until_it_returns(
     assert bench.changes == [asked, late, hot, asked]
     asyncio.run(new())
     assert bench.check.report == hot
-
-
-def test_a_node_without_one_is_asked_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(monkeypatch, None)
-    bench.check.follow(NodeState.ACTIVE)
-    assert (bench.check.report, bench.ticks) == (None, [])

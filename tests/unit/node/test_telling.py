@@ -5,15 +5,45 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connection_status import (
     ConnectionEvent,
     ConnectionEventKind,
     ConnectionEvents,
+    events_between,
 )
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
+from tests.builders import configuration
 
-NET = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_ESTABLISHED, connection="net")
-LOST = ConnectionEvent(kind=ConnectionEventKind.CONNECTION_LOST, connection="net")
+Wired = dict[str, dict[str, int]]
+"""Peers of the publishers on each connection."""
+
+
+def wired(connections: Wired) -> NodeConfiguration:
+    """Return what a node with these connections says of itself."""
+    ends = [
+        EndpointReport(
+            kind=EndpointKind.PUBLISHER,
+            name=name,
+            resolved=f"/{name}",
+            type="std_msgs/msg/String",
+            qos=None,
+            connection=connection,
+            mapped=True,
+            matched=peers,
+        )
+        for connection, on in connections.items()
+        for name, peers in on.items()
+    ]
+    made = tuple(
+        ConnectionReport(name=name, established=all(on.values()))
+        for name, on in connections.items()
+    )
+    return configuration("/it", *ends, connections=made)
 
 
 def unexpected(trace: str) -> None:
@@ -38,26 +68,55 @@ class Executor:
                     raise AssertionError("the listeners of these tests do not wait")
 
 
-def test_events_come_in_order_and_to_sync_and_async_listeners() -> None:
+@pytest.mark.parametrize(
+    ("before", "after", "events"),
+    [
+        ({}, {"net": {}}, ["made net"]),
+        ({}, {"net": {"video": 0}}, ["made net", "mapped video 0"]),
+        ({"net": {"video": 0}}, {"net": {"video": 2}}, ["mapped video 2", "made net"]),
+        ({"net": {"video": 2}}, {"net": {"video": 1}}, ["unmapped video 1"]),
+        ({"net": {"video": 2}}, {"net": {"video": 0}}, ["unmapped video 0", "lost net"]),
+        # What has no peer yet is no loss.
+        ({"net": {"video": 1}}, {"net": {"video": 1, "map": 0}}, ["mapped map 0"]),
+        ({"net": {"video": 1}}, {}, ["unmapped video gone", "lost net gone"]),
+        ({"net": {"video": 1}}, {"net": {}}, ["unmapped video gone"]),
+    ],
+)
+def test_what_is_different_is_what_listeners_are_told(
+    before: Wired, after: Wired, events: list[str]
+) -> None:
+    words = {
+        ConnectionEventKind.CONNECTION_ESTABLISHED: "made",
+        ConnectionEventKind.CONNECTION_LOST: "lost",
+        ConnectionEventKind.MAPPING_ESTABLISHED: "mapped",
+        ConnectionEventKind.MAPPING_LOST: "unmapped",
+    }
+    found = [
+        f"{words[each.kind]} {each.endpoint.partition('/')[2] or each.connection}"
+        + (" gone" if each.unmade else "" if each.peers is None else f" {each.peers}")
+        for each in events_between(wired(before), wired(after))
+    ]
+    assert found == events
+
+
+def test_sync_and_async_listeners_are_called_until_they_are_removed() -> None:
     executor = Executor()
-    events = ConnectionEvents(executor.later, {})
-    heard: list[tuple[str, ConnectionEvent]] = []
+    now = [wired({})]
+    changes = ConfigurationChanges(executor.later, lambda: now[0], failed=unexpected)
+    events = ConnectionEvents(changes, executor.later)
+    heard: list[str] = []
 
     async def listen(event: ConnectionEvent) -> None:
-        heard.append(("async", event))
+        heard.append(f"async {event.connection}")
 
-    events.listen(lambda event: heard.append(("sync", event)))
+    events.listen(lambda event: heard.append(f"sync {event.connection}"))
     remove = events.listen(listen)
-    events.notify(NET)
-    events.notify(LOST)
-    assert heard == []
-    executor.turn()
-    assert [event for kind, event in heard if kind == "sync"] == [NET, LOST]
-    assert [event for kind, event in heard if kind == "async"] == [NET, LOST]
-    remove()
-    events.notify(NET)
-    executor.turn()
-    assert [kind for kind, _ in heard[4:]] == ["sync"]
+    for name in ("net", "radio"):
+        now[0] = wired({name: {}, **{each.name: {} for each in now[0].connections}})
+        changes.touch()
+        executor.turn()
+        remove()
+    assert heard == ["sync net", "async net", "sync radio"]
 
 
 def test_many_changes_of_one_turn_are_one_notice_and_are_collected_once() -> None:

@@ -31,14 +31,11 @@ class Sign:
 class Managed:
     full_name: str
     state: NodeState = NodeState.UNCONFIGURED
-    listener: Callable[[Any], None] = lambda _: None
+    listeners: list[Callable[[Any], None]] = dataclasses.field(default_factory=list)
 
     @property
     def reported(self) -> NodeState:
         return self.state
-
-    def add_listener(self, listener: Callable[[Any], None]) -> None:
-        self.listener = listener
 
 
 class Node:
@@ -47,7 +44,8 @@ class Node:
 
     def become(self, state: NodeState) -> None:
         self.lifecycle.state = state
-        self.lifecycle.listener(self.lifecycle)
+        for listener in self.lifecycle.listeners:
+            listener(self.lifecycle)
 
 
 @pytest.fixture
@@ -67,7 +65,7 @@ def dog(sign: Sign, overlong: list[float]) -> Watchdog:
 
 def added(dog: Watchdog, name: str) -> Node:
     node = Node(name)
-    dog.add(node.lifecycle)  # type: ignore[arg-type]
+    node.lifecycle.listeners.append(dog.follow)
     return node
 
 
