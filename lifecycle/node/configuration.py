@@ -53,7 +53,6 @@ from lifecycle.node.endpoints.endpoint import (
     found_endpoint,
 )
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.negotiation.parties import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
     HealthReport,
@@ -69,6 +68,12 @@ if TYPE_CHECKING:
 
     from lifecycle.manifest.diagnostics import Position
     from lifecycle.node.lifecycle.gate import Later
+
+PARADIGMS = ("publish-subscribe", "request-response")
+"""Topics; services, and actions, which consist of both."""
+
+SERIALIZATIONS = ("cdr",)
+"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
 
 
 class HostedState(msgspec.Struct, frozen=True, kw_only=True):

@@ -2,16 +2,15 @@
 
 The first rule that applies decides; what both ends cannot have is a problem with its reason.
 
-1.  No common wire format or paradigm: a problem.
-2.  Asked for, by a link, else the publisher, else the subscription: that, if both ends can have it.
+1.  Asked for, by a link, else the publisher, else the subscription: that, if both ends can have it.
     Inside a process only `shm` and `multicast` can be asked for, and are handed over directly.
     `multicast` to another host is TCP; `network` is what is there if that is one IP transport, else
     UDP before TCP, IPv6 first where a host has an IPv6 address.
-3.  One process: handed over inside it.
-4.  An end whose transports are not known: its RMW chooses.
-5.  One host: what is there anyway if that is one transport; shared memory; one datagram to a group
+2.  One process: handed over inside it.
+3.  An end whose transports are not known: its RMW chooses.
+4.  One host: what is there anyway if that is one transport; shared memory; one datagram to a group
     (TTL 0, loopback) where several processes listen; UDP, TCP.
-6.  Two hosts: TCP if the publisher sends to a group, which stays on its host, or if the data may
+5.  Two hosts: TCP if the publisher sends to a group, which stays on its host, or if the data may
     not be lost and are more than one datagram; else what is there anyway, UDP, TCP.
 
 An end that asked for something else than what was chosen, where no link decides, is a problem.
@@ -194,9 +193,6 @@ def choose(
         listeners: processes of the publisher's host, but its own, that subscribe to the topic.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
     """
-    unable = _common_ground(pair)
-    if unable:
-        return pair.problem("", unable)
     wish, who = pair.wish
     if pair.same_process:
         if wish in (FlowTransport.ANY, FlowTransport.SHM, FlowTransport.MULTICAST):
@@ -224,21 +220,6 @@ def choose(
             "ask for the same at both ends, or let a link decide with 'transport:'",
         )
     return choice
-
-
-def _common_ground(pair: Pair) -> str:
-    """Return why the two cannot communicate whatever carries it; empty if they can."""
-    one, other = pair.publisher, pair.subscription
-    for word, mine, theirs, needed in (
-        ("wire format", one.serializations, other.serializations, {*one.serializations}),
-        ("communication paradigm", one.paradigms, other.paradigms, {"publish-subscribe"}),
-    ):
-        if not {*mine} & {*theirs} & needed:
-            return (
-                f"no {word} is common; {one.key!r} has {_list(mine)}; {other.key!r} has"
-                f" {_list(theirs)}"
-            )
-    return ""
 
 
 def _list(words: Iterable[str]) -> str:

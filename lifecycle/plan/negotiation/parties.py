@@ -43,12 +43,6 @@ from lifecycle.plan.model import (
     PlannedParticipant,
 )
 
-PARADIGMS = ("publish-subscribe", "request-response")
-"""Topics; services, and actions, which consist of both."""
-
-SERIALIZATIONS = ("cdr",)
-"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
-
 End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""
 
@@ -76,8 +70,6 @@ class Party(msgspec.Struct, frozen=True, kw_only=True):
     transports: tuple[str, ...] = CONNECTABLE
     own: tuple[str, ...] = RMW_DEFAULT
     connectable: bool = True
-    serializations: tuple[str, ...] = SERIALIZATIONS
-    paradigms: tuple[str, ...] = PARADIGMS
     endpoints: tuple[PlannedEndpoint, ...] = ()
     participants: tuple[PlannedParticipant, ...] = ()
     contacts: tuple[Contact, ...] = ()

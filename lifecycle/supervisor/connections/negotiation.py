@@ -96,8 +96,6 @@ def party_of(
         transports=(configuration.transports or CONNECTABLE) if known else (),
         own=(transports_of(own_urls) or default) if known else (),
         connectable=known,
-        serializations=configuration.serializations,
-        paradigms=configuration.paradigms,
         endpoints=tuple(
             _endpoint(each, planned, {one.connection: one.name for one in there})
             for each in configuration.endpoints

@@ -295,19 +295,6 @@ REFUSED = {
             "version: 10.77.0.1 and 10.77.0.2"
         ),
     ),
-    "no wire format": (
-        [party("p", pub()), party("s", sub(), serializations=("xcdr2",))],
-        {TO_S: Wish.UDPV4},
-        "cannot carry '/t' from 'p' to 's': no wire format is common; 'p' has cdr; 's' has xcdr2",
-    ),
-    "no paradigm": (
-        [party("p", pub()), party("s", sub(), paradigms=("request-response",))],
-        {},
-        (
-            "cannot carry '/t' from 'p' to 's': no communication paradigm is common; 'p' has "
-            "publish-subscribe, request-response; 's' has request-response"
-        ),
-    ),
     "inside a process nothing can be chosen": (
         [party("p", pub()), party("s", sub(), process="p")],
         {TO_S: Wish.UDPV4},
