@@ -67,10 +67,8 @@ from lifecycle.plan.participants import command_line, place
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     """Layer nodes so that each is one level below the last node it waits for.
 
-    Nodes of one level keep the manifest's order and do not wait for each other.
-
-    Args:
-        nodes: of a manifest without errors (`check.after-cycle`, `check.after-unknown`).
+    Nodes of one level keep the manifest's order and do not wait for each other. That there is no
+    cycle is checked before (`check.after-cycle`).
     """
     order = {node.key: index for index, node in enumerate(nodes)}
     sorter = graphlib.TopologicalSorter(
@@ -149,8 +147,6 @@ def planned_processes(
     shared_memory: bool = False,
 ) -> tuple[PlannedProcess, ...]:
     """Group nodes by process, in the order in which the manifest first names each process.
-
-    That nodes can share a process is checked by `manifest.checks`.
 
     Args:
         nodes: in manifest order.
@@ -263,13 +259,7 @@ def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
     Raises:
         UsageError: no such node, or another one of its process is not named.
     """
-    chosen = set()
-    for name in names:
-        found = [each.key for each in plan.nodes if name in (each.key, each.full_name)]
-        if not found:
-            known = ", ".join(each.key for each in plan.nodes) or "none"
-            raise UsageError(f"cannot leave out node {name!r}; nodes of {plan.system}: {known}")
-        chosen.update(found)
+    chosen = {find_node(plan, name).key for name in names}
     for process in plan.processes:
         left = chosen.intersection(process.nodes)
         if left and len(left) < len(process.nodes):
@@ -295,12 +285,7 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 
 def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
-    """Return a plan in which others run some nodes, as if the manifest attached to them.
-
-    Args:
-        plan: of the whole system.
-        keys: of nodes.
-    """
+    """Return a plan in which others run some nodes, as if the manifest attached to them."""
     chosen = frozenset(keys)
     return replace(
         plan,
@@ -330,10 +315,7 @@ def check_plan(
 ) -> tuple[Diagnostic, ...]:
     """Return why a manifest cannot be planned, as far as that does not depend on what is installed.
 
-    Args:
-        manifest: valid.
-        environment: as for `build_plan`.
-        files: parameter files of its nodes that were read already.
+    `files` are parameter files of its nodes that were read already.
     """
     variables = os.environ if environment is None else environment
     parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
@@ -532,18 +514,18 @@ def _planned_endpoint(
         raise PlanError(message, hint=hint, at=need.need.at)
     return replace(
         planned,
-        unique=need.need.unique,
-        loss=need.need.loss,
-        rate_hz=need.need.rate_hz,
-        transport=need.need.transport,
-        lossy=need.need.lossy,
-        quantities=need.need.quantities,
-        measure=need.need.measure,
+        **{name: getattr(need.need, name) for name in _ASKED},
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
         dscp_reason=need.marking.reason,
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
         max_delay_ms=need.max_delay_ms,
-        max_message_size=need.need.max_message_size,
     )
+
+
+_ASKED = (
+    *("unique", "loss", "rate_hz", "transport", "lossy", "quantities", "measure"),
+    "max_message_size",
+)
+"""What an endpoint asks of its flow and gets as it is written."""

@@ -40,10 +40,6 @@ _FLOW = (
 )
 """Fields of an endpoint that say what it asks of its flow; none asks anything by default."""
 
-_RUN_SPELLED = (
-    *("kind", "environment", "working_directory", "arguments", "executor", "extra_arguments"),
-)
-
 
 class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
     """One difference between two plans.
@@ -52,7 +48,6 @@ class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
         path: place in the manifest, `nodes.talker.run.python`.
         node: key of the node that it belongs to; empty where it belongs to the whole system.
         old: the value as text, "not set" or "not declared" without one; cut to 80 characters.
-        new: likewise.
         at: the position of the node or endpoint in the new plan; None where it has none.
     """
 
@@ -69,7 +64,11 @@ def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
     places = _positions(new)
     return tuple(
         PlanDifference(
-            path=".".join(path), node=_node_of(path), old=was, new=now, at=_at(path, places)
+            path=".".join(path),
+            node=path[1] if path[0] == "nodes" else "",
+            old=was,
+            new=now,
+            at=_at(path, places),
         )
         for path, was, now in sorted(
             _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
@@ -163,8 +162,9 @@ def _node(node: PlannedNode) -> _Tree:
 
 
 def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
-    run = {name: value for name, value in _fields(node.run, *_RUN_SPELLED).items() if value}
-    run = run or {node.run.kind.value: True}
+    spelled = ("kind", "environment", "working_directory", "arguments", "executor")
+    plain = _fields(node.run, *spelled, "extra_arguments")
+    run = {name: value for name, value in plain.items() if value} or {node.run.kind.value: True}
     if node.run.kind is RunKind.PYTHON:
         run["arguments"] = _plain(node.run.arguments)
         run["executor"] = node.run.executor.value
@@ -253,10 +253,6 @@ def _shown(value: object, absent: str) -> str:
     return text if len(text) <= _VALUE_CHARACTERS else f"{text[: _VALUE_CHARACTERS - 1]}…"
 
 
-def _node_of(path: _Path) -> str:
-    return path[1] if path[0] == "nodes" and len(path) > 1 else ""
-
-
 def _positions(plan: Plan) -> dict[_Path, Position]:
     found: dict[_Path, Position] = {}
     for node in plan.nodes:
@@ -269,10 +265,8 @@ def _positions(plan: Plan) -> dict[_Path, Position]:
 
 def _at(path: _Path, places: Mapping[_Path, Position]) -> Position | None:
     """Return the position of the innermost part of `path` that has one."""
-    for length in range(len(path), 0, -1):
-        if path[:length] in places:
-            return places[path[:length]]
-    return None
+    inner = (path[:length] for length in range(len(path), 0, -1))
+    return next((places[each] for each in inner if each in places), None)
 
 
 MAX_TEXT = 1 << 20
@@ -361,12 +355,8 @@ def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:
 
     Two systems may share a domain and their hosts, and even a name where each has machines of its
     own. But our system has one supervisor per machine, and a domain one node of a name: who runs
-    another machine of our system is concerned, and who plans a node that we plan.
-
-    Args:
-        plan: ours.
-        own: machines whose nodes we bring up.
-        notice: what the other supervisor announces.
+    another machine of our system is concerned, and who plans a node that we plan. `own` are the
+    machines whose nodes we bring up.
     """
     theirs = {each.machine for each in plan.nodes} - own - {""}
     if notice.system == plan.system and not theirs.isdisjoint(notice.machines):
