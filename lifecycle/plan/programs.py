@@ -54,13 +54,7 @@ _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
 class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
-    """Something of a node that could not be looked for here.
-
-    Attributes:
-        at: where the manifest names it; `path` is its place there.
-        subject: what it is, "class 'demo:Talker'".
-        reason: why not, half a sentence.
-    """
+    """Something of a node, "class 'demo:Talker'", that could not be looked for here, and why."""
 
     at: Position
     subject: str
@@ -72,12 +66,7 @@ class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Resolution(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of looking for everything that a manifest runs.
-
-    Attributes:
-        diagnostics: what would fail, in the order of the manifest.
-        unresolved: what could not be decided, likewise.
-    """
+    """What of everything that a manifest runs would fail, and what could not be decided."""
 
     diagnostics: tuple[Diagnostic, ...] = ()
     unresolved: tuple[UnresolvedProgram, ...] = ()
@@ -122,6 +111,7 @@ def resolve_programs(
 
 _Found = Diagnostic | UnresolvedProgram
 _Read = Callable[[tuple[str, ...], str, str], NodeClass]
+"""Returns the class of a name in a module, which is looked for in some folders first."""
 
 
 def _look(
@@ -132,15 +122,6 @@ def _look(
     authority: Authority,
     ours: bool,
 ) -> Iterator[_Found]:
-    """Look for what one node runs.
-
-    Args:
-        node: the node.
-        read: returns the class of a name in a module that is looked for in folders first.
-        environment: as for resolve_programs.
-        authority: of the data layer.
-        ours: its machine is this host.
-    """
     run = node.run
     if run.kind is RunKind.PYTHON:
         yield from _python(node, read, authority=authority, ours=ours)
@@ -246,7 +227,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         yield error(
             RULE,
             at,
-            f"cannot manage {node.key!r}: {found.name} ({found.file or 'rclpy'}) is a plain node",
+            f"cannot manage {node.key!r}: {found} is a plain node",
             "write 'managed: false'; it is held by its executor until the system is verified",
         )
     arguments = dict(node.run.arguments)
@@ -257,7 +238,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
                 yield error(
                     RULE,
                     where,
-                    f"cannot give {found.name} ({found.file}) an argument {name!r}",
+                    f"cannot give {found} an argument {name!r}",
                     did_you_mean(name, found.takes)
                     or f"it takes {', '.join(found.takes) or 'none'}",
                 )
@@ -267,7 +248,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         yield error(
             RULE,
             where,
-            f"cannot call {found.name} ({found.file}) without {', '.join(missing)}",
+            f"cannot call {found} without {', '.join(missing)}",
             "give it under 'run: {arguments: …}'",
         )
 
@@ -276,12 +257,11 @@ def _immovable(
     node: Node, found: NodeClass, at: Position, authority: Authority
 ) -> Iterator[Diagnostic]:
     """Yield what is asked of the connections of a node whose endpoints its own code makes."""
-    what = f"{found.name} ({found.file or 'rclpy'})"
     if authority is Authority.SUPERVISOR and node.managed:
         yield error(
             IMMOVABLE,
             at,
-            f"cannot leave the connections of {node.key!r} to the supervisor: {what} is not "
+            f"cannot leave the connections of {node.key!r} to the supervisor: {found} is not "
             "a lifecycle.LifecycleNode, and makes its endpoints itself",
             "derive it from lifecycle.LifecycleNode, or use 'data_layer: {authority: nodes}'",
         )
@@ -292,7 +272,7 @@ def _immovable(
                     IMMOVABLE,
                     connection.at,
                     f"cannot map {kind.noun} {name!r} of {node.key!r} to connection "
-                    f"{connection.name!r}: {what} is not a lifecycle.LifecycleNode, and only its "
+                    f"{connection.name!r}: {found} is not a lifecycle.LifecycleNode, and only its "
                     "topics can be placed",
                     "derive it from lifecycle.LifecycleNode, or leave it out of 'map'",
                 )
@@ -302,12 +282,11 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
     """Yield that a node is to be asked for its health whose class has nothing to ask."""
     if node.health is None or not node.health.check or not node.managed:
         return
-    what = f"{found.name} ({found.file or 'rclpy'})"
     if found.kind in _OF_RCLPY:
         yield error(
             NO_HEALTH,
             node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {what} is not a "
+            f"cannot ask {node.key!r} whether it is healthy: {found} is not a "
             "lifecycle.LifecycleNode",
             "derive it from lifecycle.LifecycleNode, or write 'health: {diagnostics: NAME}'",
         )
@@ -315,7 +294,7 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
         yield error(
             NO_HEALTH,
             node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {what} has no method 'health'",
+            f"cannot ask {node.key!r} whether it is healthy: {found} has no method 'health'",
             "give it 'def health(self)', which returns None if all is well and else what is "
             "wrong, or write 'health: {diagnostics: NAME}'",
         )
@@ -394,8 +373,8 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
             yield error(
                 UNHANDLED,
                 endpoint.at,
-                f"cannot serve {noun} {name!r}: no method of {found.name} ({found.file}) is "
-                f"decorated with {decorator}({name!r})",
+                f"cannot serve {noun} {name!r}: no method of {found} is decorated with "
+                f"{decorator}({name!r})",
             )
 
 

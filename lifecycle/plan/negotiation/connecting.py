@@ -45,7 +45,6 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint that must leave its node's own participant.
 
     Attributes:
-        end: how its partners know it.
         transports: what its connection must have, sorted; a group is `udpm@/topic`.
         partners: all that it exchanges data with.
     """
@@ -101,12 +100,6 @@ def connections_of(
     before: DataLayerGraph | None = None,
 ) -> tuple[NegotiatedConnection, ...]:
     """Return the connections that carry these endpoints, sorted by node and name.
-
-    Args:
-        moved: the endpoints.
-        parties: all that take part.
-        terms: what the system gives.
-        before: what is there already.
 
     Raises:
         PlanError: there are not enough ports or groups.

@@ -31,11 +31,7 @@ from lifecycle.plan.negotiation.parties import End, NegotiatedFlow, Party
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True):
-    """A publisher and a subscription of one topic.
-
-    Attributes:
-        link: the transport that a link demands.
-    """
+    """A publisher and a subscription of one topic, and what a link demands for them."""
 
     publisher: Party
     writer: PlannedEndpoint
@@ -114,16 +110,6 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def is_inside(flow: NegotiatedFlow) -> bool:
-    """Return whether a flow is handed over inside a process."""
-    return flow.medium == Medium.INTRAPROCESS
-
-
-def is_by_group(flow: NegotiatedFlow) -> bool:
-    """Return whether one datagram of a flow goes to a group."""
-    return flow.medium == Medium.UDPM
-
-
 MEETING = Medium.SHM
 """By what participants of one process find each other, if they have nothing else in common."""
 
@@ -132,16 +118,13 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     """Return by what Fast DDS 2.14 sends from a participant with some transports to another.
 
     Shared memory wins on one host. Of IP transports all that are common carry every sample, so
-    more than one means that it arrives twice.
+    more than one means that it arrives twice; none, that they never meet.
 
     Args:
         writer: transports of one participant, values of Medium; a group is
             `udpm@239.255.1.9:7901`.
         reader: of the other one.
         same_host: whether they share memory and loopback.
-
-    Returns:
-        Media, sorted; empty if they never meet.
     """
     common = _unicast(writer, same_host=same_host) & _unicast(reader, same_host=same_host)
     found = {each for each in common if each.is_network}
@@ -159,10 +142,6 @@ def discover(one: Collection[str], other: Collection[str]) -> bool:
 
     Fast DDS 2.14 announces participants by shared memory only where they have nothing else
     (`fastdds.shm.enforce_metatraffic`, by default `none`).
-
-    Args:
-        one: transports of a participant, as of `carried`.
-        other: of the other one.
     """
     networks = [
         {each for each in _unicast(transports, same_host=True) if each.is_network}
@@ -188,7 +167,7 @@ def choose(
     """Return what carries a pair.
 
     Args:
-        pair: the pair.
+        pair: a publisher and a subscription.
         by_multicast: another subscription of this publisher gets its data from a group.
         listeners: processes of the publisher's host, but its own, that subscribe to the topic.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.

@@ -19,8 +19,6 @@ from lifecycle.plan.negotiation.media import (
     carried,
     choose,
     discover,
-    is_by_group,
-    is_inside,
 )
 from lifecycle.plan.negotiation.parties import DataLayerGraph, End, NegotiatedFlow, Party, Terms
 
@@ -37,9 +35,8 @@ def negotiate(
 ) -> DataLayerGraph:
     """Choose how data get from every publisher to every subscription of its topic.
 
-    In this order: what a link demands, what the publisher asks for, what the subscription asks for,
-    the same process, the same host, another host (see `media.py`). What cannot be made
-    is a problem; everything else is negotiated all the same.
+    The rules are in `media.py`. What cannot be made is a problem; everything else is negotiated all
+    the same.
 
     Args:
         parties: nodes with their endpoints, in any order.
@@ -104,7 +101,7 @@ def _choices(pairs: Sequence[Pair], terms: Terms) -> list[NegotiatedFlow]:
                 listeners=len(listeners.get(writer, ())),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
-            if is_by_group(found[index]):
+            if found[index].medium == Medium.UDPM:
                 by_group.add(writer)
     return [found[index] for index in range(len(pairs))]
 
@@ -120,10 +117,6 @@ class _Carriers:
 
     An endpoint moves only when a pair of its gets another medium than was chosen: the publisher
     first, then the subscription. What moves takes all its media along.
-
-    Args:
-        chosen: pairs with the medium of each.
-        terms: what the system gives.
     """
 
     def __init__(self, chosen: Sequence[tuple[Pair, NegotiatedFlow]], terms: Terms) -> None:
@@ -135,11 +128,13 @@ class _Carriers:
         self._needs: dict[End, set[str]] = {}
         for pair, flow in chosen:
             # A topic has a group of its own.
-            token = f"{flow.medium}@{flow.topic}" if is_by_group(flow) else flow.medium
+            token = f"{flow.medium}@{flow.topic}" if flow.medium == Medium.UDPM else flow.medium
             sides = ((pair.publisher, pair.writer), (pair.subscription, pair.reader))
             for end, side in zip(pair.ends, sides, strict=True):
                 self._sides[end] = side
-                self._needs.setdefault(end, set()).update(() if is_inside(flow) else (token,))
+                self._needs.setdefault(end, set()).update(
+                    () if flow.medium == Medium.INTRAPROCESS else (token,)
+                )
 
     def settle(self) -> tuple[list[NegotiatedFlow], list[NegotiatedFlow]]:
         """Move endpoints until every pair has its medium; return flows, and what has it not."""
@@ -210,7 +205,7 @@ class _Carriers:
     def _holds(self, pair: Pair, flow: NegotiatedFlow) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        if is_inside(flow):
+        if flow.medium == Medium.INTRAPROCESS:
             return bool(present)
         meet = self._served or not pair.same_host or discover(*map(self._transports, pair.ends))
         return present == [flow.medium] and meet
@@ -220,7 +215,7 @@ class _Carriers:
             return True
         for end in pair.ends:
             if end in self._moved:
-                if is_inside(flow) and MEETING not in self._moved[end]:
+                if flow.medium == Medium.INTRAPROCESS and MEETING not in self._moved[end]:
                     self._moved[end].add(MEETING)
                     return True
                 continue

@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
     FlowTransport,
     RunKind,
 )
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import (
     BUILTIN_TRANSPORTS,
     CONNECTABLE,
@@ -168,13 +168,12 @@ class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
     """Return the transports of a participant with these URLs; a group as `udpm@ADDRESS:PORT`."""
-    return tuple(dict.fromkeys(_transport(parse(text)) for text in urls))
-
-
-def _transport(url: ConnectionUrl) -> str:
-    if url.transport.is_group:
-        return f"{url.transport}@{url.address}:{url.port}"
-    return url.transport
+    return tuple(
+        dict.fromkeys(
+            f"{url.transport}@{url.address}:{url.port}" if url.transport.is_group else url.transport
+            for url in map(parse, urls)
+        )
+    )
 
 
 def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], FlowTransport]:
@@ -195,7 +194,7 @@ def party_of_node(
     """Return a node as a party, from what its manifest declares alone.
 
     Args:
-        node: its participants that are declared or make flows unique in place, no negotiated ones.
+        node: without negotiated participants.
         hosts: of the system.
         rmw: the RMW identifier that it runs with.
         variables: what a COMMAND node's process gets beside its own.
@@ -232,14 +231,12 @@ def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnecti
     An extra participant that made a publisher's flow unique and carries none any more is removed;
     the publisher's connection takes its purpose.
     """
-    places: dict[str, NegotiatedConnection] = {
-        label: each for each in connections for label in each.map
-    }
+    places = {label: each for each in connections for label in each.map}
     endpoints = []
-    carriers: dict[str, PlannedParticipant] = {each.name: each for each in node.participants}
+    carriers = {each.name: each for each in node.participants}
     takes: dict[str, list[PlannedParticipant]] = {}
     for each in node.endpoints:
-        connection = places.get(f"{each.kind.value}/{each.name}")
+        connection = places.get(each.kind.spell(each.name))
         if connection is None:
             endpoints.append(each)
             continue
@@ -257,12 +254,11 @@ def _participant(
     node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
 ) -> PlannedParticipant:
     sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
-    reasons = ", ".join(dict.fromkeys(each.reason for each in replaced))
+    reason = f"connection {connection.name}, {connection.reason}"
     return PlannedParticipant(
         name=participant_name(node_name, connection.name),
         dscp=next((each.dscp for each in replaced), None),
-        reason=f"connection {connection.name}, {connection.reason}"
-        f"{f'; {reasons}' if reasons else ''}",
+        reason="; ".join([reason, *dict.fromkeys(each.reason for each in replaced)]),
         max_datagram_bytes=min(sizes, default=None),
         non_blocking_send=any(each.non_blocking_send for each in replaced),
         connection=connection.name,
