@@ -38,11 +38,9 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
         packet_delay_budget_ms: upper bound between device and N6.
         packet_error_rate: upper bound of the share of packets lost or late, 0–1.
         max_data_burst_bytes: default volume served within the delay budget; None if not applicable.
-        averaging_window_ms: default window of the guaranteed rate; None if not applicable.
         first_release: 3GPP release.
         in_release_16: one of the 26 values that *Unique Network Flows* mentions.
         flagged: fields on which the sources disagree or that only a weak one supports.
-        sources: names in the table's own list of those that agree.
         note: what is doubtful about the row; often empty.
     """
 
@@ -52,11 +50,9 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
     packet_delay_budget_ms: int
     packet_error_rate: float
     max_data_burst_bytes: int | None
-    averaging_window_ms: int | None
     first_release: int
     in_release_16: bool
     flagged: tuple[str, ...]
-    sources: tuple[str, ...]
     note: str
 
     def __str__(self) -> str:
@@ -64,24 +60,14 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ClassIssue(msgspec.Struct, frozen=True, kw_only=True):
-    """A declared need that a class does not keep.
-
-    Attributes:
-        field: the parameter of `check_class` that it is about.
-        message: starts with "cannot".
-    """
+    """A declared need, by its name in `check_class`, that a class does not keep."""
 
     field: str
     message: str
 
 
 class Proposal(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to `five_qi: auto`.
-
-    Attributes:
-        five_qi: None if no class fits.
-        why: a sentence for people either way.
-    """
+    """The answer to `five_qi: auto`; None if no class fits, with the reason either way."""
 
     five_qi: FiveQi | None
     why: str
@@ -187,14 +173,7 @@ def propose(
         gbr: True asks for a guaranteed bit rate, False for none, None for either.
         message_bytes: largest message that must arrive within the delay, > 0.
         rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
-
-    Raises:
-        ValueError: a bound is out of range.
     """
-    if not max_delay_ms > 0:
-        raise ValueError(f"cannot use max_delay_ms {max_delay_ms:g}; use more than 0")
-    if not 0 < loss <= 1:
-        raise ValueError(f"cannot use loss {loss:g}; use more than 0, at most 1")
     offered = [
         each
         for each in five_qis()
@@ -214,16 +193,12 @@ def propose(
     if not fitting:
         why = _why_none(offered, max_delay_ms, loss, message_bytes, rate_bps)
         return Proposal(five_qi=None, why=why)
-    best = max(
-        fitting,
-        key=lambda each: (
-            each.in_release_16,
-            each.packet_delay_budget_ms,
-            each.packet_error_rate,
-            each.priority_level,
-            -each.value,
-        ),
-    )
+
+    def undemanding(each: FiveQi) -> tuple[object, ...]:
+        bounds = (each.packet_delay_budget_ms, each.packet_error_rate, each.priority_level)
+        return (each.in_release_16, *bounds, -each.value)
+
+    best = max(fitting, key=undemanding)
     release = "Release 16" if best.in_release_16 else f"Release {best.first_release}"
     return Proposal(
         five_qi=best,
