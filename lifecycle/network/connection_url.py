@@ -1,9 +1,8 @@
 """Connection URLs of `connect_to`: parse and write transport, address, port and options.
 
-Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways; which transport has
-which option, how a value is read and spelled, and the option names. The idea is that of
-*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); which URLs
-one participant cannot have together. What a URL becomes is decided in middleware/. Pure.
+Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways, after
+*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"), and which
+URLs one participant cannot have together. What a URL becomes is decided in middleware/. Pure.
 
     udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999&peer=10.77.0.2:7910&multicast=off
     udpv6://[fd77::1]:7911?metatraffic_port=7910&peer=[fd77::2]:7910&multicast=off
