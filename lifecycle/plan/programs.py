@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
@@ -38,7 +38,6 @@ from lifecycle.plan.python_source import (
 RULE = "program.missing"
 UNHANDLED = "program.handler"
 UNDECLARED = "program.endpoint"
-IMMOVABLE = "program.connection"
 NO_HEALTH = "program.health"
 IMPORT = "program.import"
 UNCALLED = "program.callback"
@@ -49,7 +48,6 @@ _WORDS = {
     EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
     EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
 }
-_OF_RCLPY = (ClassKind.MANAGED, ClassKind.PLAIN)
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
@@ -95,13 +93,7 @@ def resolve_programs(
     found = [
         each
         for node in manifest.nodes
-        for each in _look(
-            node,
-            read,
-            environment=environment,
-            authority=manifest.data_layer.authority,
-            ours=is_ours(node.machine),
-        )
+        for each in _look(node, read, environment, ours=is_ours(node.machine))
     ]
     return Resolution(
         diagnostics=tuple(each for each in found if isinstance(each, Diagnostic)),
@@ -115,16 +107,11 @@ _Read = Callable[[tuple[str, ...], str, str], NodeClass]
 
 
 def _look(
-    node: Node,
-    read: _Read,
-    *,
-    environment: Mapping[str, str],
-    authority: Authority,
-    ours: bool,
+    node: Node, read: _Read, environment: Mapping[str, str], *, ours: bool
 ) -> Iterator[_Found]:
     run = node.run
     if run.kind is RunKind.PYTHON:
-        yield from _python(node, read, authority=authority, ours=ours)
+        yield from _python(node, read, ours=ours)
     elif run.kind is RunKind.COMMAND:
         part, subject = "run.command", f"program {run.command[0]!r}" if run.command else ""
         if not run.command:
@@ -153,7 +140,7 @@ def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ou
     return UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
-def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Iterator[_Found]:
+def _python(node: Node, read: _Read, *, ours: bool) -> Iterator[_Found]:
     subject = f"class {node.run.python!r}"
     at = _at(node, "run.python")
     module, separator, name = node.run.python.partition(":")
@@ -180,8 +167,6 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
         )
         return
     yield from _called(node, found, at)
-    if found.kind in _OF_RCLPY:
-        yield from _immovable(node, found, at, authority)
     yield from _without_health(node, found)
     yield from _slips(node, found, at, ours=ours)
     yield from _interface(node, found, at, subject)
@@ -253,36 +238,11 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         )
 
 
-def _immovable(
-    node: Node, found: NodeClass, at: Position, authority: Authority
-) -> Iterator[Diagnostic]:
-    """Yield what is asked of the connections of a node whose endpoints its own code makes."""
-    if authority is Authority.SUPERVISOR and node.managed:
-        yield error(
-            IMMOVABLE,
-            at,
-            f"cannot leave the connections of {node.key!r} to the supervisor: {found} is not "
-            "a lifecycle.LifecycleNode, and makes its endpoints itself",
-            "derive it from lifecycle.LifecycleNode, or use 'data_layer: {authority: nodes}'",
-        )
-    for connection in node.connections:
-        for kind, name in connection.map:
-            if not kind.is_topic:
-                yield error(
-                    IMMOVABLE,
-                    connection.at,
-                    f"cannot map {kind.noun} {name!r} of {node.key!r} to connection "
-                    f"{connection.name!r}: {found} is not a lifecycle.LifecycleNode, and only its "
-                    "topics can be placed",
-                    "derive it from lifecycle.LifecycleNode, or leave it out of 'map'",
-                )
-
-
 def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
     """Yield that a node is to be asked for its health whose class has nothing to ask."""
     if node.health is None or not node.health.check or not node.managed:
         return
-    if found.kind in _OF_RCLPY:
+    if found.kind in (ClassKind.MANAGED, ClassKind.PLAIN):
         yield error(
             NO_HEALTH,
             node.where("health"),
