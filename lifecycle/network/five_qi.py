@@ -139,7 +139,7 @@ def check_class(
     if burst is None:
         return tuple(found)
     served = f"with {class_}: by default it serves {burst} bytes in {budget_ms} ms"
-    served_bps = _served_bps(class_)
+    served_bps = burst * 8000 / budget_ms
     if rate_bps is not None and rate_bps > served_bps:
         issue(
             "rate_bps",
@@ -174,15 +174,12 @@ def propose(
         message_bytes: largest message that must arrive within the delay, > 0.
         rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
     """
-    offered = [
-        each
-        for each in five_qis()
-        if not each.flagged and gbr in (None, each.resource_type.guarantees_rate)
-    ]
     fitting = [
         each
-        for each in offered
-        if not check_class(
+        for each in five_qis()
+        if not each.flagged
+        and gbr in (None, each.resource_type.guarantees_rate)
+        and not check_class(
             each,
             max_delay_ms=max_delay_ms,
             loss=loss,
@@ -191,7 +188,10 @@ def propose(
         )
     ]
     if not fitting:
-        why = _why_none(offered, max_delay_ms, loss, message_bytes, rate_bps)
+        why = f"cannot propose a 5QI: no class keeps a delay of {max_delay_ms:g} ms"
+        why += f", a loss of {loss:g}"
+        why += "" if message_bytes is None else f", messages of {message_bytes} bytes"
+        why += "" if rate_bps is None else f", {rate_bps:g} bit/s"
         return Proposal(five_qi=None, why=why)
 
     def undemanding(each: FiveQi) -> tuple[object, ...]:
@@ -206,48 +206,6 @@ def propose(
         f"rate {best.packet_error_rate:g} <= {loss:g}; the least demanding class of {release} "
         f"that fits",
     )
-
-
-def _why_none(
-    offered: list[FiveQi],
-    max_delay_ms: float,
-    loss: float,
-    message_bytes: int | None,
-    rate_bps: float | None,
-) -> str:
-    """Name the first bound that rules out what was left of the classes."""
-    left = [each for each in offered if not check_class(each, loss=loss)]
-    if not left:
-        lowest = min(offered, key=lambda each: each.packet_error_rate)
-        return (
-            f"cannot propose a 5QI for a loss of {loss:g}: "
-            f"the lowest error rate is {lowest.packet_error_rate:g}, of {lowest}"
-        )
-    fast = [each for each in left if not check_class(each, max_delay_ms=max_delay_ms)]
-    if not fast:
-        fastest = min(left, key=lambda each: each.packet_delay_budget_ms)
-        return (
-            f"cannot propose a 5QI for a delay of {max_delay_ms:g} ms with a loss of {loss:g}: the "
-            f"shortest delay budget is {fastest.packet_delay_budget_ms} ms, of {fastest}"
-        )
-    roomy = [each for each in fast if not check_class(each, message_bytes=message_bytes)]
-    if roomy:
-        # A class that states no burst serves any rate, so one that states it is what is left.
-        fastest = max(roomy, key=_served_bps)
-        return (
-            f"cannot propose a 5QI for {rate_bps:g} bit/s in {max_delay_ms:g} ms with a loss of "
-            f"{loss:g}: the highest rate is {_served_bps(fastest):g} bit/s, of {fastest}"
-        )
-    largest = max(fast, key=lambda each: each.max_data_burst_bytes or 0)
-    return (
-        f"cannot propose a 5QI for messages of {message_bytes} bytes in {max_delay_ms:g} ms with a "
-        f"loss of {loss:g}: the largest burst is {largest.max_data_burst_bytes} bytes, of {largest}"
-    )
-
-
-def _served_bps(each: FiveQi) -> float:
-    """Bits per second that a class serves within its delay budget by default; 0 if not stated."""
-    return (each.max_data_burst_bytes or 0) * 8000 / each.packet_delay_budget_ms
 
 
 class DscpMapping(msgspec.Struct, frozen=True, kw_only=True):

@@ -91,31 +91,29 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
     Several links on one pair add up: the strongest uniqueness and the shortest delay hold. A link
     that names two nodes is kept even if they declare no such endpoints, so that it can be judged.
     """
-    hearers: dict[str, list[str]] = {}
+    subscribers: dict[str, list[str]] = {}
     for node in nodes:
         for topic in _topics(node, EndpointKind.SUBSCRIPTION):
-            hearers.setdefault(topic, []).append(node.key)
-    pairs: dict[tuple[str, str, str], None] = {}
-    for publisher in nodes:
-        for topic in _topics(publisher, EndpointKind.PUBLISHER):
-            for subscription in hearers.get(topic, ()):
-                pairs[topic, publisher.key, subscription] = None
-    named: dict[tuple[str, str, str], list[Link]] = {}
+            subscribers.setdefault(topic, []).append(node.key)
+    pairs: dict[tuple[str, str, str], list[Link]] = {
+        (topic, publisher.key, subscription): []
+        for publisher in nodes
+        for topic in _topics(publisher, EndpointKind.PUBLISHER)
+        for subscription in subscribers.get(topic, ())
+    }
     for link in links:
-        named.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
+        pairs.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
     asked = {(node.key, each.resolved) for node in nodes for each in node.endpoints if each.measure}
     foreign = {node.key for node in nodes if node.run.kind is not RunKind.PYTHON}
     found = []
-    for pair in {**pairs, **named}:
+    for pair, on_it in pairs.items():
         topic, *ends = pair
-        on_it = named.get(pair, ())
         measure = any(each.measure for each in on_it) or any((end, topic) in asked for end in ends)
         found.append(replace(_flow(pair, on_it), measure=measure and ends[1] in foreign))
     return tuple(found)
 
 
 def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
-    """Resolved names of one kind, each once, in order."""
     return dict.fromkeys(each.resolved for each in node.endpoints if each.kind is kind)
 
 

@@ -38,11 +38,7 @@ Values = Mapping[str, ParameterValue]
 
 
 class GivenParameters(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameters of a node that may be set while it runs: their values before and from now on.
-
-    Attributes:
-        types: of each, as in ExpectedParameter.
-    """
+    """Parameters of a node that may be set while it runs: their values, and types."""
 
     before: Values
     now: Values
@@ -54,7 +50,7 @@ class PlanChange(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         differences: of what the manifests declare; none: there is nothing to do.
-        added: keys of nodes that only the new plan has, likewise of the others.
+        added: keys of nodes that only the new plan has.
         removed: keys of nodes that only the running plan has.
         restarted: keys of nodes that both have, and whose processes must be started again.
         parameters: by key, of nodes that are only to be given parameters.

@@ -28,6 +28,8 @@ from lifecycle.plan.secrets import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
 
+_SYSTEM = ("system", "discovery", "network", "data_layer")
+
 _NODE = (
     *("name", "namespace", "machine", "managed", "timeouts", "log_level", "state", "may_end"),
     *("health", "process"),
@@ -93,11 +95,8 @@ _Path = tuple[str, ...]
 def _document(plan: Plan) -> _Tree:
     """Return what is declared, as mappings by the manifest's keys."""
     document: dict[str, object] = {
-        "system": plan.system,
+        **{name: to_plain(getattr(plan, name)) for name in _SYSTEM},
         "machines": {each.name: {"address": each.address} for each in plan.machines},
-        "discovery": to_plain(plan.discovery),
-        "network": to_plain(plan.network),
-        "data_layer": to_plain(plan.data_layer),
         "policy": {**_fields(plan.policy), "ros_interface": plan.policy.access.value},
         "on_violation": _consequences(plan.on_violation),
         "modes": {
@@ -282,13 +281,10 @@ class PlanNotice(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         run: one run of it, unique.
-        host: its machine id, see node.machine_id.
-        system: name of the system.
+        host: its machine id.
         machines: those whose nodes it brings up.
         nodes: fully qualified names of all nodes of the plan.
-        checksum: of what is planned, see comparison.plan_checksum.
-        left: it is being shut down, or has been.
-        reason: why; empty unless it left.
+        left: it is being shut down, or has been, for this reason.
     """
 
     run: str
@@ -369,11 +365,9 @@ _MOST_LINES = 20
 
 def difference_lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     """Phrase differences with their places in the new manifest, at most 20 of them."""
-    every = tuple(found)
-    lines = []
-    for each in every[:_MOST_LINES]:
-        place = f"{each.at.spelled}: " if each.at else ""
-        lines.append(f"{place}{each.path}: was {each.old}, is {each.new}")
-    if len(every) > _MOST_LINES:
-        lines.append(f"and {len(every) - _MOST_LINES} more")
-    return tuple(lines)
+    lines = [
+        f"{f'{each.at.spelled}: ' if each.at else ''}{each.path}: was {each.old}, is {each.new}"
+        for each in found
+    ]
+    more = len(lines) - _MOST_LINES
+    return (*lines[:_MOST_LINES], *([f"and {more} more"] if more > 0 else []))
