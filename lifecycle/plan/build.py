@@ -522,8 +522,5 @@ def _planned_endpoint(
     )
 
 
-_ASKED = (
-    *("unique", "loss", "rate_hz", "transport", "lossy", "quantities", "measure"),
-    "max_message_size",
-)
+_ASKED = ("unique", "transport", "lossy", "quantities", "measure", "max_message_size")
 """What an endpoint asks of its flow and gets as it is written."""

@@ -22,7 +22,7 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import OnViolation, RunKind
+from lifecycle.manifest.model import QUANTILE, OnViolation, Quantity, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
 from lifecycle.plan.secrets import shown, without_secrets
 
@@ -36,11 +36,8 @@ _NODE = (
 )
 """Fields of a node that are in its document as they are; what is planned from them is in none."""
 
-_FLOW = (
-    *("unique", "dscp", "transport", "lossy", "five_qi", "max_delay_ms", "loss", "rate_hz"),
-    "max_message_size",
-)
-"""Fields of an endpoint that say what it asks of its flow; none asks anything by default."""
+_FLOW = ("unique", "dscp", "transport", "lossy", "measure")
+"""Fields of an endpoint that say what it asks of its flow, beside numbers; none by default."""
 
 
 class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,8 +107,10 @@ def _document(plan: Plan) -> _Tree:
         },
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
-                name: to_plain(getattr(flow, name))
-                for name in ("unique", "max_delay_ms", "transport")
+                "unique": flow.unique.value,
+                "transport": flow.transport.value,
+                **_numbers(flow.quantities),
+                **({"measure": True} if flow.measure else {}),
             }
             for flow in plan.flows
             if flow.linked
@@ -206,6 +205,7 @@ def _flows(node: PlannedNode) -> _Tree:
             for name in _FLOW
             if getattr(each, name) != _NOT_ASKED[name]
         }
+        asked.update(_numbers(each.quantities))
         if each.five_qi_reason:  # proposed for what is declared
             asked.pop("dscp", None)
             asked["five_qi"] = "auto"
@@ -215,6 +215,17 @@ def _flows(node: PlannedNode) -> _Tree:
             asked["non_blocking_send"] = True
         found.setdefault(each.kind.value, {})[each.name] = asked
     return found
+
+
+def _numbers(quantities: Iterable[Quantity]) -> dict[str, object]:
+    """Return numbers by their keys; those of several links on one pair are a list."""
+    found: dict[str, list[object]] = {}
+    for each in quantities:
+        plain = each.value if each.most is None else str(each).removeprefix(f"{each.name} ")
+        found.setdefault(each.name, []).append(plain)
+        if each.quantile != QUANTILE:
+            found.setdefault("quantile", []).append(each.quantile)
+    return {name: each[0] if len(each) == 1 else each for name, each in found.items()}
 
 
 _NOT_ASKED = {each.name: each.default for each in msgspec.structs.fields(PlannedEndpoint)}

@@ -143,9 +143,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
 
     Attributes:
         resolved: fully qualified topic, service or action name after namespace and remap.
-        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
-            declared.
-        rate_hz: messages per second, > 0; None if not declared.
         transport: NETWORK must not go by shared memory.
         lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
             the QoS and to the node's own hint, which this overrides.
@@ -163,8 +160,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
 
     resolved: str
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    loss: float | None = None
-    rate_hz: float | None = None
     transport: FlowTransport = FlowTransport.ANY
     lossy: bool | None = None
     quantities: tuple[Quantity, ...] = ()

@@ -52,7 +52,13 @@ _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
 class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
-    """Something of a node, "class 'demo:Talker'", that could not be looked for here, and why."""
+    """Something of a node that could not be looked for here.
+
+    Attributes:
+        at: where the manifest names it; `path` is its place there.
+        subject: what it is, "class 'demo:Talker'".
+        reason: why not, half a sentence.
+    """
 
     at: Position
     subject: str

@@ -19,6 +19,8 @@ from lifecycle.plan.negotiation.media import (
     carried,
     choose,
     discover,
+    is_by_group,
+    is_inside,
 )
 from lifecycle.plan.negotiation.parties import DataLayerGraph, End, NegotiatedFlow, Party, Terms
 
@@ -101,7 +103,7 @@ def _choices(pairs: Sequence[Pair], terms: Terms) -> list[NegotiatedFlow]:
                 listeners=len(listeners.get(writer, ())),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
-            if found[index].medium == Medium.UDPM:
+            if is_by_group(found[index]):
                 by_group.add(writer)
     return [found[index] for index in range(len(pairs))]
 
@@ -128,13 +130,11 @@ class _Carriers:
         self._needs: dict[End, set[str]] = {}
         for pair, flow in chosen:
             # A topic has a group of its own.
-            token = f"{flow.medium}@{flow.topic}" if flow.medium == Medium.UDPM else flow.medium
+            token = f"{flow.medium}@{flow.topic}" if is_by_group(flow) else flow.medium
             sides = ((pair.publisher, pair.writer), (pair.subscription, pair.reader))
             for end, side in zip(pair.ends, sides, strict=True):
                 self._sides[end] = side
-                self._needs.setdefault(end, set()).update(
-                    () if flow.medium == Medium.INTRAPROCESS else (token,)
-                )
+                self._needs.setdefault(end, set()).update(() if is_inside(flow) else (token,))
 
     def settle(self) -> tuple[list[NegotiatedFlow], list[NegotiatedFlow]]:
         """Move endpoints until every pair has its medium; return flows, and what has it not."""
@@ -205,7 +205,7 @@ class _Carriers:
     def _holds(self, pair: Pair, flow: NegotiatedFlow) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        if flow.medium == Medium.INTRAPROCESS:
+        if is_inside(flow):
             return bool(present)
         meet = self._served or not pair.same_host or discover(*map(self._transports, pair.ends))
         return present == [flow.medium] and meet
@@ -215,7 +215,7 @@ class _Carriers:
             return True
         for end in pair.ends:
             if end in self._moved:
-                if flow.medium == Medium.INTRAPROCESS and MEETING not in self._moved[end]:
+                if is_inside(flow) and MEETING not in self._moved[end]:
                     self._moved[end].add(MEETING)
                     return True
                 continue
