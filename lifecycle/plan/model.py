@@ -352,14 +352,12 @@ class PlannedServer(msgspec.Struct, frozen=True, kw_only=True):
         address: given to clients, and listened on.
         port: 1–65535.
         tcp: over TCP; else UDP.
-        prefix: its GUID prefix, as in connection URLs.
     """
 
     machine: str
     address: str
     port: Port
     tcp: bool = True
-    prefix: str
 
 
 class Plan(SystemDeclaration, frozen=True, kw_only=True):

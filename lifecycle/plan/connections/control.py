@@ -34,8 +34,6 @@ from lifecycle.plan.model import (
     PlannedServer,
 )
 
-DEFAULT_PREFIX = ConnectionUrl(transport=DEFAULT_TCP).server_prefix
-
 
 class Control(msgspec.Struct, frozen=True, kw_only=True):
     """The control plane of a system.
@@ -160,7 +158,6 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
         address=hosts.address(host),
         port=pool.take(host)[0],
         tcp=tcp,
-        prefix=DEFAULT_PREFIX,
     )
 
 
