@@ -29,8 +29,6 @@ from lifecycle.plan.model import (
 )
 from lifecycle.printable import columns, count
 
-RMW_CHOOSES = "as the RMW chooses"
-
 
 def _data_layer(plan: Plan, width: int) -> list[str]:
     """Describe how participants find each other and who connects them; nothing if all is usual."""
@@ -79,7 +77,7 @@ def _connections(plan: Plan, width: int) -> list[str]:
 
 
 def _spelled(each: ParticipantConnections) -> list[str]:
-    texts = list(each.urls) or [RMW_CHOOSES]
+    texts = list(each.urls) or ["as the RMW chooses"]
     if each.static_name:
         texts.append(f"known to others as {each.static_name}, without being told")
     if each.super_client:
