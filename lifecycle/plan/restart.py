@@ -193,8 +193,7 @@ def _on_next_port(
     """
     host, url = now
     listeners = [each for each, (other, _) in original.items() if each[0] and other == host]
-    taken = {each: set(ports) for each, ports in terms_of(first).taken}
-    pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, taken)
+    pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, terms_of(first).taken)
     mine, had = listeners.index(place), url.port or 0
     port = pool.take(host, len(listeners))[mine]
     if had != original[place][1].port:

@@ -153,7 +153,7 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
 
 def _with_ports(drafts: Sequence[_Draft], kept: _Urls, terms: Terms) -> _Urls:
     """Return the URLs of new connections with ports and groups of their own, without peers."""
-    pool = PortPool(terms.first_port, dict(terms.taken))
+    pool = PortPool(terms.first_port, terms.taken)
     hosts = sorted({each.party.host for each in drafts})
     groups: dict[str, ConnectionUrl] = {}
     for draft in drafts:

@@ -8,7 +8,7 @@ Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 import msgspec
@@ -112,7 +112,7 @@ class Terms(msgspec.Struct, frozen=True, kw_only=True):
     server: Peer | None = None
     server_medium: Medium = DEFAULT_TCP
     first_port: int = 7910
-    taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    taken: Mapping[str, Collection[int]] = msgspec.field(default_factory=dict)
     multicast_group: str = "239.255.1.1"
     max_datagram_bytes: int | None = None
     observers: tuple[Contact, ...] = ()
@@ -293,7 +293,7 @@ def terms_of(plan: Plan) -> Terms:
         server=None if server is None else Peer(address=server.address, port=server.port),
         server_medium=DEFAULT_TCP if server is None or server.tcp else RMW_DISCOVERY,
         first_port=plan.discovery.first_port,
-        taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
+        taken=taken,
         multicast_group=plan.data_layer.multicast_group,
         max_datagram_bytes=plan.network.max_datagram_bytes,
         observers=tuple(

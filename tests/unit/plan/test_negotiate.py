@@ -234,7 +234,7 @@ MADE = {
     "where ports are fixed connections have all of theirs": (
         [party("p", pub(), own=("shm",)), party("s", sub(), own=("shm",))],
         {TO_S: Wish.UDPV4},
-        Terms(fixed=True, taken=((HERE, (7911,)),)),
+        Terms(fixed=True, taken={HERE: (7911,)}),
         {"s": ("udpv4", "a link says so")},
         {
             "p udpv4": (
