@@ -78,11 +78,7 @@ def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
     - Loopback and link-local addresses mean something on their own machine and link only
       (RFC 6890, RFC 4007).
 
-    Args:
-        a: textual address of one socket.
-        b: textual address of the other.
-        same_machine: whether both are on one machine; None when that is not known, which answers
-            "may be" wherever it matters.
+    Where it is not known whether both are on one machine (None), they may be the same.
     """
     one, other = parse_address(a), parse_address(b)
     if one is None or other is None:
@@ -219,11 +215,8 @@ def dissimilar(a: LocatedNfe, b: LocatedNfe) -> bool:
     """Return whether one or more networking resources of two NFEs differ.
 
     Addresses differ unless packets of both can carry the same one: a publisher that sends from
-    `0.0.0.0:p` sends from every address of its machine, and two machines' `0.0.0.0` differ.
-
-    Args:
-        a: one NFE.
-        b: the other; both of publishers or both of subscriptions.
+    `0.0.0.0:p` sends from every address of its machine, and two machines' `0.0.0.0` differ. Both
+    are of publishers or both of subscriptions.
     """
     one, other = a.nfe, b.nfe
     if replace(one, internet_address="") != replace(other, internet_address=""):

@@ -213,15 +213,11 @@ def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
 
     0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
     """
-    runs: list[range] = []
-    for domain_id in range(MAX_DOMAIN_ID + 1):
-        if max_participants(domain_id, ephemeral).participants == 0:
-            continue
-        if runs and runs[-1].stop == domain_id:
-            runs[-1] = range(runs[-1].start, domain_id + 1)
-        else:
-            runs.append(range(domain_id, domain_id + 1))
-    return tuple(runs)
+    domains = range(MAX_DOMAIN_ID + 1)
+    safe = {each for each in domains if max_participants(each, ephemeral).participants}
+    first = [each for each in domains if each in safe and each - 1 not in safe]
+    last = [each for each in domains if each in safe and each + 1 not in safe]
+    return tuple(range(one, other + 1) for one, other in zip(first, last, strict=True))
 
 
 def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:

@@ -148,7 +148,7 @@ def planned_processes(
 
     Args:
         nodes: in manifest order.
-        domain_id: 0–232.
+        domain_id: given to every process.
         discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
             that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
             127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.

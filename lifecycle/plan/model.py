@@ -44,10 +44,6 @@ def declared(as_: type, by: object) -> dict[str, Any]:
 
     A plan's types extend those of the manifest, so that what is declared is written down once, and
     JSON of a plan has it beside what was planned.
-
-    Args:
-        as_: the manifest's type.
-        by: a value of it, or of a type that extends it.
     """
     return {each.name: getattr(by, each.name) for each in msgspec.structs.fields(as_)}
 

@@ -44,12 +44,7 @@ class _Given(NamedTuple):
 
 
 class NodeParameters:
-    """What parameters the nodes of one manifest must have.
-
-    Args:
-        files: that its nodes name.
-        modes: of that manifest.
-    """
+    """What parameters the nodes of one manifest must have, by its files and in its modes."""
 
     def __init__(self, files: ParameterFiles, modes: tuple[Mode, ...] = ()) -> None:
         self._files = files

@@ -177,11 +177,7 @@ class _Definition(msgspec.Struct, frozen=True):
 
 
 class Sources:
-    """Modules as one process would find them.
-
-    Args:
-        folders: looked in first, as `python -m` looks in its working directory.
-    """
+    """Modules as one process would find them, which looks first in some folders."""
 
     def __init__(self, folders: Sequence[str]) -> None:
         self._folders = tuple(folders)
@@ -268,9 +264,7 @@ class Sources:
     def _has(self, package: str) -> bool:
         try:
             self._locate(package)
-        except UnknownError:
-            return True
-        except NotThereError as problem:
+        except (NotThereError, UnknownError) as problem:
             return not problem.message.startswith("cannot find module")
         return True
 

@@ -98,12 +98,7 @@ def _participants(plan: Plan, width: int) -> list[str]:
 def render_text(plan: Plan, *, width: int = 100) -> str:
     """Print processes, order, nodes with endpoints, extra participants and flows.
 
-    Args:
-        plan: what to print.
-        width: columns to fit into where words allow it, >= 40.
-
-    Returns:
-        Lines, each ended by a newline.
+    Lines fit into `width` columns, at least 40, where words allow it.
     """
     width = max(width, 40)
     sections: tuple[tuple[str, Callable[[Plan, int], list[str]]], ...] = (

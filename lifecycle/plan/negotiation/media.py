@@ -58,15 +58,6 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
         return self.same_host and self.publisher.process == self.subscription.process
 
     @property
-    def present(self) -> list[Medium]:
-        """By what the data go if neither end leaves its participant, see `carried`."""
-        return carried(
-            self.publisher.transports_at(self.writer),
-            self.subscription.transports_at(self.reader),
-            same_host=self.same_host,
-        )
-
-    @property
     def common(self) -> set[str]:
         """Media that both ends can have."""
         both = {*_able(self.publisher)} & {*_able(self.subscription)}
@@ -235,9 +226,8 @@ def _able(party: Party) -> tuple[str, ...]:
 
 def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> NegotiatedFlow:
     if wish is FlowTransport.NETWORK:
-        present = pair.present
-        there = present[0] if len(present) == 1 and present[0] in wish.media else ""
-        medium = there or _first_ip(pair)
+        default = _default(pair)
+        medium = default if default in wish.media else _first_ip(pair)
         return pair.by(medium, who) if medium else _none_common(pair, " by the network")
     if wish is FlowTransport.MULTICAST and not pair.same_host:
         wish, who = FlowTransport.TCPV4, "multicast stays on its host"
@@ -264,7 +254,11 @@ def _first_ip(pair: Pair) -> str:
 
 def _default(pair: Pair) -> str:
     """Return what carries the pair anyway; empty if that is nothing, or arrives twice."""
-    present = pair.present
+    present = carried(
+        pair.publisher.transports_at(pair.writer),
+        pair.subscription.transports_at(pair.reader),
+        same_host=pair.same_host,
+    )
     return present[0] if len(present) == 1 else ""
 
 
