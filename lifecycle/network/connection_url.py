@@ -1,9 +1,8 @@
 """Connection URLs of `connect_to`: parse and write transport, address, port and options.
 
-Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways; which transport has
-which option, how a value is read and spelled, and the option names. The idea is that of
-*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); which URLs
-one participant cannot have together. What a URL becomes is decided in middleware/. Pure.
+Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways, after
+*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"), and which
+URLs one participant cannot have together. What a URL becomes is decided in middleware/. Pure.
 
     udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999&peer=10.77.0.2:7910&multicast=off
     udpv6://[fd77::1]:7911?metatraffic_port=7910&peer=[fd77::2]:7910&multicast=off
@@ -96,14 +95,7 @@ _IP = frozenset(each for each in SCHEMES if each.is_network)
 
 
 class Option(msgspec.Struct, frozen=True, kw_only=True):
-    """One option.
-
-    Attributes:
-        attribute: of ConnectionUrl.
-        read: returns the parsed value, given the option's name and the text.
-        transports: that have the option.
-        repeated: it may be given several times.
-    """
+    """One option; `read` returns its value from its name and text."""
 
     attribute: str
     read: Callable[[str, str], Any]
@@ -137,12 +129,8 @@ OPTIONS = {
 }
 
 
-def read_options(transport: Medium, query: str) -> dict[str, Any]:
-    """Return the options after `?`, by attribute of ConnectionUrl.
-
-    Raises:
-        ConnectionUrlError: an unknown option, one that the transport has not, or a bad value.
-    """
+def _read_options(transport: Medium, query: str) -> dict[str, Any]:
+    """Return the options after `?`, by attribute of ConnectionUrl."""
     read: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in OPTIONS:
@@ -206,7 +194,16 @@ class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         """Return the URL; `parse` of it is equal to this."""
-        return _spell(self)
+        own = Peer(address=self.address, port=self.port)
+        default = ConnectionUrl(transport=self.transport)
+        words = [
+            (name, text)
+            for name, option in OPTIONS.items()
+            if (value := getattr(self, option.attribute)) != getattr(default, option.attribute)
+            for text in option.spell(value)
+        ]
+        query = urlencode(words, safe=":[]")
+        return f"{self.transport.value}://{own}{'?' + query if query else ''}"
 
     @property
     def family(self) -> Medium:
@@ -274,46 +271,34 @@ def parse(text: str) -> ConnectionUrl:
             transport has not, an address of the wrong family.
     """
     try:
-        parts = urlsplit(text)
-        port = parts.port
-        host = parts.hostname or ""
-    except ValueError as error:
-        bad = "its port is no number of 1–65535" if _has_host(text) else str(error)
-        raise ConnectionUrlError(
-            f"cannot read connection URL {text!r}: {bad}", hint=_HOW
-        ) from error
-    try:
-        transport = SCHEMES[SCHEMES.index(Medium(parts.scheme))]
-    except ValueError:
-        allowed = ", ".join(SCHEMES)
-        # urlsplit takes no scheme with an underscore (RFC 3986 §3.1), `zmq_pgm` of the article.
-        scheme = parts.scheme or (text.partition("://")[0] if "://" in text else "")
-        raise ConnectionUrlError(
-            f"cannot read connection URL {text!r}: unknown transport {scheme!r}; "
-            f"allowed: {allowed}",
-            hint=did_you_mean(scheme, SCHEMES) or _HOW,
-        ) from None
-    if parts.path not in ("", "/") or parts.fragment or parts.username or parts.password:
-        raise ConnectionUrlError(
-            f"cannot read connection URL {text!r}: only address, port and options are allowed",
-            hint=_HOW,
-        )
-    try:
-        options = read_options(transport, parts.query)
-        url = ConnectionUrl(transport=transport, address=host, port=port, **options)
-        _check(url)
+        return _parsed(text)
     except ConnectionUrlError as error:
         message = f"cannot read connection URL {text!r}: {error.message}"
         raise ConnectionUrlError(message, hint=error.hint) from None
-    return url
 
 
-def _has_host(text: str) -> bool:
-    """Whether the part before the port can be read."""
+def _parsed(text: str) -> ConnectionUrl:
     try:
-        return bool(urlsplit(text).scheme) and urlsplit(text).hostname is not None
-    except ValueError:
-        return False
+        parts = urlsplit(text)
+        host, port = parts.hostname or "", parts.port
+    except ValueError as error:
+        is_port = str(error).startswith("Port ")
+        bad = "its port is no number of 1–65535" if is_port else str(error)
+        raise ConnectionUrlError(bad, hint=_HOW) from error
+    # urlsplit takes no scheme with an underscore (RFC 3986 §3.1), `zmq_pgm` of the article.
+    scheme = parts.scheme or (text.partition("://")[0] if "://" in text else "")
+    transport = next((each for each in SCHEMES if each == scheme), None)
+    if transport is None:
+        raise ConnectionUrlError(
+            f"unknown transport {scheme!r}; allowed: {', '.join(SCHEMES)}",
+            hint=did_you_mean(scheme, SCHEMES) or _HOW,
+        )
+    if parts.path not in ("", "/") or parts.fragment or parts.username or parts.password:
+        raise ConnectionUrlError("only address, port and options are allowed", hint=_HOW)
+    options = _read_options(transport, parts.query)
+    url = ConnectionUrl(transport=transport, address=host, port=port, **options)
+    _check(url)
+    return url
 
 
 def _check(url: ConnectionUrl) -> None:
@@ -340,15 +325,3 @@ def _check(url: ConnectionUrl) -> None:
         raise ConnectionUrlError("udpm needs a group, udpm://239.255.1.9:7901")
     if url.transport.is_group and url.port is None:
         raise ConnectionUrlError("udpm needs a port, udpm://239.255.1.9:7901")
-
-
-def _spell(url: ConnectionUrl) -> str:
-    own = Peer(address=url.address, port=url.port)
-    default = ConnectionUrl(transport=url.transport)
-    words: list[tuple[str, str]] = []
-    for name, option in OPTIONS.items():
-        value = getattr(url, option.attribute)
-        if value != getattr(default, option.attribute):
-            words += [(name, text) for text in option.spell(value)]
-    query = urlencode(words, safe=":[]")
-    return f"{url.transport.value}://{own}{'?' + query if query else ''}"

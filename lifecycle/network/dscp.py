@@ -27,21 +27,11 @@ ECN_MASK = 0b11
 
 
 class CodePoint(msgspec.Struct, frozen=True, kw_only=True):
-    """One named code point.
-
-    Attributes:
-        dscp: 0–63.
-        rfc: the document that assigns it.
-        phb: per-hop behaviour.
-        service_class: RFC 4594's service class; empty where it names none.
-    """
+    """One named code point; the table also has its RFC, behaviour and service class."""
 
     name: str
     dscp: int
     aliases: tuple[str, ...]
-    rfc: str
-    phb: str
-    service_class: str
 
 
 class _DscpTable(msgspec.Struct, frozen=True, kw_only=True):
@@ -124,30 +114,19 @@ def _tos_hint(number: int) -> str:
 def dscp_name(dscp: int) -> str:
     """Return the code point's name, or the number in decimal where it has none.
 
-    `parse_dscp` reads either back.
-
-    Raises:
-        ValueError: not 0–63.
+    `parse_dscp` reads either back, and refuses what is not 0–63.
     """
     number = parse_dscp(dscp)
     return _by_number()[number].name if number in _by_number() else str(number)
 
 
 def tos(dscp: int) -> int:
-    """Return the TOS byte (IPv4) or traffic class (IPv6), 0–252, that carries this DSCP, ECN clear.
-
-    Raises:
-        ValueError: not 0–63.
-    """
+    """Return the TOS byte (IPv4) or traffic class (IPv6) that carries this DSCP, ECN clear."""
     return parse_dscp(dscp) << 2
 
 
 def describe(dscp: int) -> str:
-    """Return DSCP and TOS side by side: `EF = DSCP 46 = TOS 184 (0xb8)`.
-
-    Raises:
-        ValueError: not 0–63.
-    """
+    """Return DSCP and TOS side by side: `EF = DSCP 46 = TOS 184 (0xb8)`."""
     name = dscp_name(dscp)
     prefix = "" if name.isdecimal() else f"{name} = "
     return f"{prefix}DSCP {dscp} = TOS {tos(dscp)} (0x{tos(dscp):02x})"
@@ -188,7 +167,7 @@ class MappedPriority(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         tos: 0–255; None if the mask is 0 and the TOS byte is not set.
-        ignored_bits: bits of the priority that made no difference: outside the mask or shifted out.
+        ignored_bits: of the priority, outside the mask or shifted out.
     """
 
     tos: int | None

@@ -38,11 +38,9 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
         packet_delay_budget_ms: upper bound between device and N6.
         packet_error_rate: upper bound of the share of packets lost or late, 0–1.
         max_data_burst_bytes: default volume served within the delay budget; None if not applicable.
-        averaging_window_ms: default window of the guaranteed rate; None if not applicable.
         first_release: 3GPP release.
         in_release_16: one of the 26 values that *Unique Network Flows* mentions.
         flagged: fields on which the sources disagree or that only a weak one supports.
-        sources: names in the table's own list of those that agree.
         note: what is doubtful about the row; often empty.
     """
 
@@ -52,11 +50,9 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
     packet_delay_budget_ms: int
     packet_error_rate: float
     max_data_burst_bytes: int | None
-    averaging_window_ms: int | None
     first_release: int
     in_release_16: bool
     flagged: tuple[str, ...]
-    sources: tuple[str, ...]
     note: str
 
     def __str__(self) -> str:
@@ -64,24 +60,14 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ClassIssue(msgspec.Struct, frozen=True, kw_only=True):
-    """A declared need that a class does not keep.
-
-    Attributes:
-        field: the parameter of `check_class` that it is about.
-        message: starts with "cannot".
-    """
+    """A declared need, by its name in `check_class`, that a class does not keep."""
 
     field: str
     message: str
 
 
 class Proposal(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to `five_qi: auto`.
-
-    Attributes:
-        five_qi: None if no class fits.
-        why: a sentence for people either way.
-    """
+    """The answer to `five_qi: auto`; None if no class fits, with the reason either way."""
 
     five_qi: FiveQi | None
     why: str
@@ -153,7 +139,7 @@ def check_class(
     if burst is None:
         return tuple(found)
     served = f"with {class_}: by default it serves {burst} bytes in {budget_ms} ms"
-    served_bps = _served_bps(class_)
+    served_bps = burst * 8000 / budget_ms
     if rate_bps is not None and rate_bps > served_bps:
         issue(
             "rate_bps",
@@ -187,23 +173,13 @@ def propose(
         gbr: True asks for a guaranteed bit rate, False for none, None for either.
         message_bytes: largest message that must arrive within the delay, > 0.
         rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
-
-    Raises:
-        ValueError: a bound is out of range.
     """
-    if not max_delay_ms > 0:
-        raise ValueError(f"cannot use max_delay_ms {max_delay_ms:g}; use more than 0")
-    if not 0 < loss <= 1:
-        raise ValueError(f"cannot use loss {loss:g}; use more than 0, at most 1")
-    offered = [
-        each
-        for each in five_qis()
-        if not each.flagged and gbr in (None, each.resource_type.guarantees_rate)
-    ]
     fitting = [
         each
-        for each in offered
-        if not check_class(
+        for each in five_qis()
+        if not each.flagged
+        and gbr in (None, each.resource_type.guarantees_rate)
+        and not check_class(
             each,
             max_delay_ms=max_delay_ms,
             loss=loss,
@@ -212,18 +188,17 @@ def propose(
         )
     ]
     if not fitting:
-        why = _why_none(offered, max_delay_ms, loss, message_bytes, rate_bps)
+        why = f"cannot propose a 5QI: no class keeps a delay of {max_delay_ms:g} ms"
+        why += f", a loss of {loss:g}"
+        why += "" if message_bytes is None else f", messages of {message_bytes} bytes"
+        why += "" if rate_bps is None else f", {rate_bps:g} bit/s"
         return Proposal(five_qi=None, why=why)
-    best = max(
-        fitting,
-        key=lambda each: (
-            each.in_release_16,
-            each.packet_delay_budget_ms,
-            each.packet_error_rate,
-            each.priority_level,
-            -each.value,
-        ),
-    )
+
+    def undemanding(each: FiveQi) -> tuple[object, ...]:
+        bounds = (each.packet_delay_budget_ms, each.packet_error_rate, each.priority_level)
+        return (each.in_release_16, *bounds, -each.value)
+
+    best = max(fitting, key=undemanding)
     release = "Release 16" if best.in_release_16 else f"Release {best.first_release}"
     return Proposal(
         five_qi=best,
@@ -231,48 +206,6 @@ def propose(
         f"rate {best.packet_error_rate:g} <= {loss:g}; the least demanding class of {release} "
         f"that fits",
     )
-
-
-def _why_none(
-    offered: list[FiveQi],
-    max_delay_ms: float,
-    loss: float,
-    message_bytes: int | None,
-    rate_bps: float | None,
-) -> str:
-    """Name the first bound that rules out what was left of the classes."""
-    left = [each for each in offered if not check_class(each, loss=loss)]
-    if not left:
-        lowest = min(offered, key=lambda each: each.packet_error_rate)
-        return (
-            f"cannot propose a 5QI for a loss of {loss:g}: "
-            f"the lowest error rate is {lowest.packet_error_rate:g}, of {lowest}"
-        )
-    fast = [each for each in left if not check_class(each, max_delay_ms=max_delay_ms)]
-    if not fast:
-        fastest = min(left, key=lambda each: each.packet_delay_budget_ms)
-        return (
-            f"cannot propose a 5QI for a delay of {max_delay_ms:g} ms with a loss of {loss:g}: the "
-            f"shortest delay budget is {fastest.packet_delay_budget_ms} ms, of {fastest}"
-        )
-    roomy = [each for each in fast if not check_class(each, message_bytes=message_bytes)]
-    if roomy:
-        # A class that states no burst serves any rate, so one that states it is what is left.
-        fastest = max(roomy, key=_served_bps)
-        return (
-            f"cannot propose a 5QI for {rate_bps:g} bit/s in {max_delay_ms:g} ms with a loss of "
-            f"{loss:g}: the highest rate is {_served_bps(fastest):g} bit/s, of {fastest}"
-        )
-    largest = max(fast, key=lambda each: each.max_data_burst_bytes or 0)
-    return (
-        f"cannot propose a 5QI for messages of {message_bytes} bytes in {max_delay_ms:g} ms with a "
-        f"loss of {loss:g}: the largest burst is {largest.max_data_burst_bytes} bytes, of {largest}"
-    )
-
-
-def _served_bps(each: FiveQi) -> float:
-    """Bits per second that a class serves within its delay budget by default; 0 if not stated."""
-    return (each.max_data_burst_bytes or 0) * 8000 / each.packet_delay_budget_ms
 
 
 class DscpMapping(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,10 +1,8 @@
 """Transports between participants: UDP, TCP, shared memory, multicast; size of a UDP datagram.
 
-Owns: the one enum of media, with what plan, checks, adapter and verification ask of each; they ask
-a member and compare it with none, so that a new medium is one entry here. `FlowTransport`, the
-values of a manifest's `transport:`; MTU, and what of a datagram IP fragments. What Fast DDS calls a
-transport in a profile is in `middleware.fastdds.url_profile`; which medium two ends get, and why,
-in `plan.negotiation.media`. Pure.
+Owns: the one enum of media, with what others ask of each; `FlowTransport`, the values of a
+manifest's `transport:`; MTU, and what of a datagram IP fragments. Which medium two ends get, and
+why, is in `plan.negotiation.media`. Pure.
 
 A UDP datagram that does not fit the path's MTU is split by IP. Only the first fragment carries the
 ports, so that a rule on ports treats the others as something else, and one lost fragment loses them
@@ -111,12 +109,11 @@ class Medium(str, enum.Enum):
     @property
     def meaning(self) -> str:
         """What people read; of an IP transport its value."""
-        meanings = {
+        return {
             Medium.SHM: "shared memory",
             Medium.UDPM: "UDP multicast",
             Medium.INTRAPROCESS: "handed over inside their process",
-        }
-        return meanings.get(self, self.value)
+        }.get(self, self.value)
 
 
 def udp_to(address: str) -> Medium:
@@ -253,20 +250,11 @@ def max_unfragmented(*, ipv6: bool) -> int:
 
 
 def datagram_bytes(message_bytes: int) -> int:
-    """Return the UDP payload, bytes, of a message that RTPS does not split.
-
-    Args:
-        message_bytes: serialized, with the four bytes of its encapsulation, > 0.
-    """
+    """Return the UDP payload, bytes, of a serialized message that RTPS does not split."""
     padded = (message_bytes + 3) // 4 * 4  # submessages start at multiples of 4
     return padded + RTPS_OVERHEAD_BYTES
 
 
 def is_fragmented(message_bytes: int, max_datagram_bytes: int) -> bool:
-    """Return whether IP would split the datagram of a message.
-
-    Args:
-        message_bytes: serialized, > 0.
-        max_datagram_bytes: UDP payload that the path carries whole.
-    """
+    """Return whether IP splits a message, if a UDP payload may have so many bytes at most."""
     return datagram_bytes(message_bytes) > max_datagram_bytes

@@ -5,14 +5,11 @@ demanded; which NFEs of a publisher (source) and a subscription (destination) fo
 5-tuple, on IPv6 a flow label beside it, and the DSCP; addresses as text: one spelling each, by the
 scope rules of RFC 4007 and RFC 6890. Pure.
 
-The article defines uniqueness for one NFE. An endpoint usually has several: one per interface, one
-per transport, multicast beside unicast, and the middleware chooses per packet. Here an endpoint
-is unique when *every* IP NFE of it is dissimilar to every NFE of every other endpoint: the
-article's own getter example compares all pairs so, and one shared NFE (a multicast group, say) is a
-path on which the network cannot distinguish the endpoints.
-
-A publisher's NFE is the source of a flow and a subscription's the destination, two different places
-of the tuple; so publishers are compared with publishers and subscriptions with subscriptions.
+The article defines uniqueness for one NFE. An endpoint usually has several, and the middleware
+chooses per packet. Here an endpoint is unique when *every* IP NFE of it is dissimilar to every NFE
+of every other endpoint, as in the article's getter example: one shared NFE (a multicast group, say)
+is a path on which the network cannot distinguish the endpoints. Publishers (sources of flows) are
+compared with publishers, subscriptions (destinations) with subscriptions.
 """
 
 from __future__ import annotations
@@ -81,11 +78,7 @@ def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
     - Loopback and link-local addresses mean something on their own machine and link only
       (RFC 6890, RFC 4007).
 
-    Args:
-        a: textual address of one socket.
-        b: textual address of the other.
-        same_machine: whether both are on one machine; None when that is not known, which answers
-            "may be" wherever it matters.
+    Where it is not known whether both are on one machine (None), they may be the same.
     """
     one, other = parse_address(a), parse_address(b)
     if one is None or other is None:
@@ -201,21 +194,12 @@ def located(
 ) -> tuple[LocatedNfe, ...] | None:
     """Return an endpoint's NFEs with their machine; None (not known) stays None.
 
-    Args:
-        nfes: as the RMW reports them.
-        machine_id: of the process that reports them.
-        dscp: 0–63, as read back from the sender sockets. Fast DDS always reports 0, whatever is
-            marked, so what was read back replaces it.
+    `dscp` is read back from the sender sockets: Fast DDS always reports 0, whatever is marked.
     """
     if nfes is None:
         return None
-    return tuple(
-        LocatedNfe(
-            machine_id=machine_id,
-            nfe=each if dscp is None else replace(each, dscp=dscp),
-        )
-        for each in nfes
-    )
+    marked = nfes if dscp is None else (replace(each, dscp=dscp) for each in nfes)
+    return tuple(LocatedNfe(machine_id=machine_id, nfe=each) for each in marked)
 
 
 def is_ip(nfe: NetworkFlowEndpoint) -> bool:
@@ -231,26 +215,18 @@ def dissimilar(a: LocatedNfe, b: LocatedNfe) -> bool:
     """Return whether one or more networking resources of two NFEs differ.
 
     Addresses differ unless packets of both can carry the same one: a publisher that sends from
-    `0.0.0.0:p` sends from every address of its machine, and two machines' `0.0.0.0` differ.
-
-    Args:
-        a: one NFE.
-        b: the other; both of publishers or both of subscriptions.
+    `0.0.0.0:p` sends from every address of its machine, and two machines' `0.0.0.0` differ. Both
+    are of publishers or both of subscriptions.
     """
-    if _exact_resources(a.nfe) != _exact_resources(b.nfe):
+    one, other = a.nfe, b.nfe
+    if replace(one, internet_address="") != replace(other, internet_address=""):
         return True
     machines = a.machine_id, b.machine_id
     return not may_be_same(
-        a.nfe.internet_address,
-        b.nfe.internet_address,
+        one.internet_address,
+        other.internet_address,
         same_machine=machines[0] == machines[1] if all(machines) else None,
     )
-
-
-def _exact_resources(nfe: NetworkFlowEndpoint) -> tuple[object, ...]:
-    """The resources but the address, which is compared by meaning."""
-    protocols = (nfe.internet_protocol, nfe.transport_protocol)
-    return (*protocols, nfe.transport_port, nfe.dscp, nfe.flow_label)
 
 
 class FlowTuple(msgspec.Struct, frozen=True, kw_only=True):
@@ -311,10 +287,9 @@ def flow_tuples(
     only ever sends to a loopback address. Shared memory forms no flow.
     """
     senders = [each for each in source if is_ip(each)]
-    found: dict[FlowTuple, None] = {}
-    for end in destination:
-        for sender in _senders_to(end, senders) if is_ip(end) else ():
-            flow = FlowTuple(
+    return tuple(
+        dict.fromkeys(
+            FlowTuple(
                 transport_protocol=end.transport_protocol,
                 internet_protocol=end.internet_protocol,
                 source_address=canonical(sender.internet_address),
@@ -324,8 +299,11 @@ def flow_tuples(
                 flow_label=sender.flow_label,
                 dscp=sender.dscp,
             )
-            found[flow] = None
-    return tuple(found)
+            for end in destination
+            if is_ip(end)
+            for sender in _senders_to(end, senders)
+        )
+    )
 
 
 def _senders_to(

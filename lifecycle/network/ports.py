@@ -16,20 +16,13 @@ import msgspec
 
 from lifecycle.printable import count
 
-PB = 7400
-"""Port base."""
-DG = 250
-"""Domain gain: the ports that one domain owns."""
-PG = 2
-"""Participant gain: the unicast ports that one participant owns."""
-D0 = 0
-"""Offset of discovery (metatraffic) multicast."""
-D1 = 10
-"""Offset of discovery (metatraffic) unicast."""
-D2 = 1
-"""Offset of user multicast."""
-D3 = 11
-"""Offset of user unicast."""
+PB = 7400  # port base
+DG = 250  # domain gain: the ports that one domain owns
+PG = 2  # participant gain: the unicast ports that one participant owns
+D0 = 0  # offset of discovery (metatraffic) multicast
+D1 = 10  # of discovery unicast
+D2 = 1  # of user multicast
+D3 = 11  # of user unicast
 
 MAX_PORT = 65535
 MAX_DOMAIN_ID = 232
@@ -50,7 +43,7 @@ EPHEMERAL_RANGE_FILE = "/proc/sys/net/ipv4/ip_local_port_range"
 
 
 def domain_of(text: str) -> int | None:
-    """Return the domain id that ROS_DOMAIN_ID sets, 0–232; None for what is none."""
+    """Return the domain id that ROS_DOMAIN_ID sets, 0–232; None for any other text."""
     if not (text.isascii() and text.isdecimal() and len(text) < 10):
         return None
     return domain if (domain := int(text)) <= MAX_DOMAIN_ID else None
@@ -94,12 +87,7 @@ class ParticipantPorts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Capacity(msgspec.Struct, frozen=True, kw_only=True):
-    """How many participants of one domain fit on one host.
-
-    Attributes:
-        participants: participants 0 to `participants - 1` are free of conflict.
-        limit: what the next one would run into, a phrase for people.
-    """
+    """How many participants of a domain fit on one host, and what the next one would run into."""
 
     participants: int
     limit: str
@@ -167,10 +155,6 @@ def unicast_pairs(
     """Return the ports for discovery and user data of the first participants of one host.
 
     As many as exist: the highest domain has fewer.
-
-    Args:
-        domain_id: 0–232.
-        participants: ≥ 0; by default all that a host can have.
     """
     first = participant_ports(domain_id, 0)
     between = first.user_unicast - first.discovery_unicast
@@ -208,37 +192,20 @@ def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
 
 
 def max_participants(domain_id: int, ephemeral: EphemeralRange) -> Capacity:
-    """Return how many participants of a domain fit on one host, each process being at least one.
-
-    Args:
-        domain_id: 0–232.
-        ephemeral: the host's ephemeral range.
-
-    Raises:
-        ValueError: the domain is not 0–232.
-    """
+    """Return how many participants of a domain fit on one host, each process being at least one."""
     base = domain_base(domain_id)
-    found = [
-        Capacity(
-            participants=(MAX_PORT - base - D3) // PG + 1,
-            limit=f"the highest port, {MAX_PORT}",
-        )
-    ]
+    found = [((MAX_PORT - base - D3) // PG + 1, f"the highest port, {MAX_PORT}")]
     if domain_id < MAX_DOMAIN_ID:
-        found.append(
-            Capacity(
-                participants=PARTICIPANTS_PER_DOMAIN,
-                limit=f"the ports of domain {domain_id + 1}, from {base + DG}",
-            )
-        )
+        next_domain = f"the ports of domain {domain_id + 1}, from {base + DG}"
+        found.append((PARTICIPANTS_PER_DOMAIN, next_domain))
     inside = f"the ephemeral ports {ephemeral}"
     if base + D0 in ephemeral or base + D2 in ephemeral:
-        found.append(Capacity(participants=0, limit=f"{inside}: they hold its multicast ports"))
+        found.append((0, f"{inside}: they hold its multicast ports"))
     elif ephemeral.last >= base + D1:
         # The first participant whose upper port is not below the range is the first inside it.
-        free = max(0, -(-(ephemeral.first - base - D3) // PG))
-        found.append(Capacity(participants=free, limit=inside))
-    return min(found, key=lambda each: each.participants)
+        found.append((max(0, -(-(ephemeral.first - base - D3) // PG)), inside))
+    participants, limit = min(found, key=lambda each: each[0])
+    return Capacity(participants=participants, limit=limit)
 
 
 def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
@@ -246,15 +213,11 @@ def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
 
     0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
     """
-    runs: list[range] = []
-    for domain_id in range(MAX_DOMAIN_ID + 1):
-        if max_participants(domain_id, ephemeral).participants == 0:
-            continue
-        if runs and runs[-1].stop == domain_id:
-            runs[-1] = range(runs[-1].start, domain_id + 1)
-        else:
-            runs.append(range(domain_id, domain_id + 1))
-    return tuple(runs)
+    domains = range(MAX_DOMAIN_ID + 1)
+    safe = {each for each in domains if max_participants(each, ephemeral).participants}
+    first = [each for each in domains if each in safe and each - 1 not in safe]
+    last = [each for each in domains if each in safe and each + 1 not in safe]
+    return tuple(range(one, other + 1) for one, other in zip(first, last, strict=True))
 
 
 def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
@@ -300,13 +263,7 @@ def overflows(
         unique_subscriptions: asked for on the host.
         ephemeral: the host's ephemeral range.
         host: what to call it, "machine 'robot'".
-
-    Raises:
-        ValueError: the domain is not 0–232, or a number is negative.
     """
-    if participants < 0 or unique_subscriptions < 0:
-        fewest = min(participants, unique_subscriptions)
-        raise ValueError(f"cannot count {fewest} participants or subscriptions; use 0 or more")
     found: list[str] = []
     capacity = max_participants(domain_id, ephemeral)
     if participants > capacity.participants:

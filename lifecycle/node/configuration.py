@@ -50,7 +50,6 @@ from lifecycle.node.endpoints.endpoint import (
     wire_name,
 )
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
-from lifecycle.plan.negotiation.parties import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
     HealthReport,
@@ -67,6 +66,12 @@ if TYPE_CHECKING:
     from lifecycle.manifest.diagnostics import Position
     from lifecycle.node.host.adoption import Hosted
     from lifecycle.node.lifecycle.gate import Later
+
+PARADIGMS = ("publish-subscribe", "request-response")
+"""Topics; services, and actions, which consist of both."""
+
+SERIALIZATIONS = ("cdr",)
+"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
 
 
 class HostedState(msgspec.Struct, frozen=True, kw_only=True):

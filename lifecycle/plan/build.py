@@ -67,10 +67,8 @@ from lifecycle.plan.participants import command_line, place
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     """Layer nodes so that each is one level below the last node it waits for.
 
-    Nodes of one level keep the manifest's order and do not wait for each other.
-
-    Args:
-        nodes: of a manifest without errors (`check.after-cycle`, `check.after-unknown`).
+    Nodes of one level keep the manifest's order and do not wait for each other. That there is no
+    cycle is checked before (`check.after-cycle`).
     """
     order = {node.key: index for index, node in enumerate(nodes)}
     sorter = graphlib.TopologicalSorter(
@@ -93,31 +91,29 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
     Several links on one pair add up: the strongest uniqueness and the shortest delay hold. A link
     that names two nodes is kept even if they declare no such endpoints, so that it can be judged.
     """
-    hearers: dict[str, list[str]] = {}
+    subscribers: dict[str, list[str]] = {}
     for node in nodes:
         for topic in _topics(node, EndpointKind.SUBSCRIPTION):
-            hearers.setdefault(topic, []).append(node.key)
-    pairs: dict[tuple[str, str, str], None] = {}
-    for publisher in nodes:
-        for topic in _topics(publisher, EndpointKind.PUBLISHER):
-            for subscription in hearers.get(topic, ()):
-                pairs[topic, publisher.key, subscription] = None
-    named: dict[tuple[str, str, str], list[Link]] = {}
+            subscribers.setdefault(topic, []).append(node.key)
+    pairs: dict[tuple[str, str, str], list[Link]] = {
+        (topic, publisher.key, subscription): []
+        for publisher in nodes
+        for topic in _topics(publisher, EndpointKind.PUBLISHER)
+        for subscription in subscribers.get(topic, ())
+    }
     for link in links:
-        named.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
+        pairs.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
     asked = {(node.key, each.resolved) for node in nodes for each in node.endpoints if each.measure}
     foreign = {node.key for node in nodes if node.run.kind is not RunKind.PYTHON}
     found = []
-    for pair in {**pairs, **named}:
+    for pair, on_it in pairs.items():
         topic, *ends = pair
-        on_it = named.get(pair, ())
         measure = any(each.measure for each in on_it) or any((end, topic) in asked for end in ends)
         found.append(replace(_flow(pair, on_it), measure=measure and ends[1] in foreign))
     return tuple(found)
 
 
 def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
-    """Resolved names of one kind, each once, in order."""
     return dict.fromkeys(each.resolved for each in node.endpoints if each.kind is kind)
 
 
@@ -150,11 +146,9 @@ def planned_processes(
 ) -> tuple[PlannedProcess, ...]:
     """Group nodes by process, in the order in which the manifest first names each process.
 
-    That nodes can share a process is checked by `manifest.checks`.
-
     Args:
         nodes: in manifest order.
-        domain_id: 0–232.
+        domain_id: given to every process.
         discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
             that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
             127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.
@@ -263,13 +257,7 @@ def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
     Raises:
         UsageError: no such node, or another one of its process is not named.
     """
-    chosen = set()
-    for name in names:
-        found = [each.key for each in plan.nodes if name in (each.key, each.full_name)]
-        if not found:
-            known = ", ".join(each.key for each in plan.nodes) or "none"
-            raise UsageError(f"cannot leave out node {name!r}; nodes of {plan.system}: {known}")
-        chosen.update(found)
+    chosen = {find_node(plan, name).key for name in names}
     for process in plan.processes:
         left = chosen.intersection(process.nodes)
         if left and len(left) < len(process.nodes):
@@ -295,12 +283,7 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 
 def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
-    """Return a plan in which others run some nodes, as if the manifest attached to them.
-
-    Args:
-        plan: of the whole system.
-        keys: of nodes.
-    """
+    """Return a plan in which others run some nodes, as if the manifest attached to them."""
     chosen = frozenset(keys)
     return replace(
         plan,
@@ -330,10 +313,7 @@ def check_plan(
 ) -> tuple[Diagnostic, ...]:
     """Return why a manifest cannot be planned, as far as that does not depend on what is installed.
 
-    Args:
-        manifest: valid.
-        environment: as for `build_plan`.
-        files: parameter files of its nodes that were read already.
+    `files` are parameter files of its nodes that were read already.
     """
     variables = os.environ if environment is None else environment
     parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
@@ -532,18 +512,15 @@ def _planned_endpoint(
         raise PlanError(message, hint=hint, at=need.need.at)
     return replace(
         planned,
-        unique=need.need.unique,
-        loss=need.need.loss,
-        rate_hz=need.need.rate_hz,
-        transport=need.need.transport,
-        lossy=need.need.lossy,
-        quantities=need.need.quantities,
-        measure=need.need.measure,
+        **{name: getattr(need.need, name) for name in _ASKED},
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
         dscp_reason=need.marking.reason,
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
         max_delay_ms=need.max_delay_ms,
-        max_message_size=need.need.max_message_size,
     )
+
+
+_ASKED = ("unique", "transport", "lossy", "quantities", "measure", "max_message_size")
+"""What an endpoint asks of its flow and gets as it is written."""

@@ -7,7 +7,7 @@ by. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import msgspec
@@ -20,8 +20,8 @@ from lifecycle.plan.model import ExpectedParameter, Plan, PlannedEndpoint, Plann
 from lifecycle.plan.parameters import COMMAND
 
 _JUDGED_BY = (
-    *("enforce_dscp", "dscp_reason", "five_qi", "five_qi_reason", "max_delay_ms", "loss"),
-    *("rate_hz", "quantities", "type_hash", "qos_defaults"),
+    *("enforce_dscp", "dscp_reason", "five_qi", "five_qi_reason", "max_delay_ms", "quantities"),
+    *("measure", "type_hash", "qos_defaults"),
 )
 """Fields of an endpoint that its process does not know: they are for the verdict and networks."""
 
@@ -34,17 +34,11 @@ _ENDPOINT: dict[str, Any] = {
 _NOT_SET = ("array", "byte_array")
 """Types of which a value alone does not say how it is to be sent."""
 
-_PARAMETER_WORDS = ("-p", "--params-file")
-
 Values = Mapping[str, ParameterValue]
 
 
 class GivenParameters(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameters of a node that may be set while it runs: their values before and from now on.
-
-    Attributes:
-        types: of each, as in ExpectedParameter.
-    """
+    """Parameters of a node that may be set while it runs: their values, and types."""
 
     before: Values
     now: Values
@@ -56,7 +50,7 @@ class PlanChange(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         differences: of what the manifests declare; none: there is nothing to do.
-        added: keys of nodes that only the new plan has, likewise of the others.
+        added: keys of nodes that only the new plan has.
         removed: keys of nodes that only the running plan has.
         restarted: keys of nodes that both have, and whose processes must be started again.
         parameters: by key, of nodes that are only to be given parameters.
@@ -141,40 +135,21 @@ def _as_run(node: PlannedNode) -> object:
         on_violation=(),
         timeouts=node.timeouts if hosted else Timeouts(),
     )
-    return without_positions(bare)
+    return _without_positions(to_plain(bare))
 
 
-def without_positions(value: object) -> object:
-    """Return a part of a plan as plain data, without where in the manifest it is declared."""
-
-    def bare(plain: object) -> object:
-        if isinstance(plain, dict):
-            return {key: bare(each) for key, each in plain.items() if key != "at"}
-        if isinstance(plain, list | tuple):
-            return [bare(each) for each in plain]
-        return plain
-
-    return bare(to_plain(value))
+def _without_positions(plain: object) -> object:
+    if isinstance(plain, dict):
+        return {key: _without_positions(each) for key, each in plain.items() if key != "at"}
+    return [*map(_without_positions, plain)] if isinstance(plain, list | tuple) else plain
 
 
 def _processes(plan: Plan) -> Mapping[str, object]:
-    """Return what each process is started with, but for parameters, which may be set later."""
+    """Return what each process is started with, beside what its nodes have of it."""
     return {
-        each.name: (each.machine, frozenset(each.nodes), _words(each.argv), each.environment)
+        each.name: (each.machine, frozenset(each.nodes), each.environment)
         for each in plan.processes
     }
-
-
-def _words(argv: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(_not_parameters(iter(argv)))
-
-
-def _not_parameters(words: Iterator[str]) -> Iterator[str]:
-    for word in words:
-        if word in _PARAMETER_WORDS:
-            next(words, None)
-        elif word != "--ros-args":  # which is there only where something follows
-            yield word
 
 
 def _whole(keys: Collection[str], plans: Iterable[Plan]) -> set[str]:
@@ -207,20 +182,16 @@ def _settable(old: PlannedNode, new: PlannedNode) -> GivenParameters | None:
     types: dict[str, str] = {}
     for name in dict.fromkeys((*was, *becomes)):
         one, other = was.get(name), becomes.get(name)
-        if _given(one) == _given(other):
-            continue
-        if one is None or other is None or one.value is None or other.value is None:
+        if one is None or other is None:
             return None
+        if (one.type, one.value) == (other.type, other.value):
+            continue
         if one.type != other.type or not (_may_be_set(one) and _may_be_set(other)):
             return None
         before[name], now[name], types[name] = one.raw, other.raw, other.type
     return GivenParameters(before=before, now=now, types=types)
 
 
-def _given(parameter: ExpectedParameter | None) -> object:
-    return None if parameter is None else (parameter.type, parameter.value)
-
-
 def _may_be_set(parameter: ExpectedParameter) -> bool:
-    plain = parameter.type not in _NOT_SET
-    return plain and not parameter.read_only and parameter.source != COMMAND
+    known = parameter.value is not None and parameter.type not in _NOT_SET
+    return known and not parameter.read_only and parameter.source != COMMAND

@@ -22,11 +22,13 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import OnViolation, RunKind
+from lifecycle.manifest.model import QUANTILE, OnViolation, Quantity, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
 from lifecycle.plan.secrets import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
+
+_SYSTEM = ("system", "discovery", "network", "data_layer")
 
 _NODE = (
     *("name", "namespace", "machine", "managed", "timeouts", "log_level", "state", "may_end"),
@@ -34,15 +36,8 @@ _NODE = (
 )
 """Fields of a node that are in its document as they are; what is planned from them is in none."""
 
-_FLOW = (
-    *("unique", "dscp", "transport", "lossy", "five_qi", "max_delay_ms", "loss", "rate_hz"),
-    "max_message_size",
-)
-"""Fields of an endpoint that say what it asks of its flow; none asks anything by default."""
-
-_RUN_SPELLED = (
-    *("kind", "environment", "working_directory", "arguments", "executor", "extra_arguments"),
-)
+_FLOW = ("unique", "dscp", "transport", "lossy", "measure")
+"""Fields of an endpoint that say what it asks of its flow, beside numbers; none by default."""
 
 
 class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,7 +47,6 @@ class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
         path: place in the manifest, `nodes.talker.run.python`.
         node: key of the node that it belongs to; empty where it belongs to the whole system.
         old: the value as text, "not set" or "not declared" without one; cut to 80 characters.
-        new: likewise.
         at: the position of the node or endpoint in the new plan; None where it has none.
     """
 
@@ -69,7 +63,11 @@ def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
     places = _positions(new)
     return tuple(
         PlanDifference(
-            path=".".join(path), node=_node_of(path), old=was, new=now, at=_at(path, places)
+            path=".".join(path),
+            node=path[1] if path[0] == "nodes" else "",
+            old=was,
+            new=now,
+            at=_at(path, places),
         )
         for path, was, now in sorted(
             _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
@@ -94,11 +92,8 @@ _Path = tuple[str, ...]
 def _document(plan: Plan) -> _Tree:
     """Return what is declared, as mappings by the manifest's keys."""
     document: dict[str, object] = {
-        "system": plan.system,
+        **{name: to_plain(getattr(plan, name)) for name in _SYSTEM},
         "machines": {each.name: {"address": each.address} for each in plan.machines},
-        "discovery": to_plain(plan.discovery),
-        "network": to_plain(plan.network),
-        "data_layer": to_plain(plan.data_layer),
         "policy": {**_fields(plan.policy), "ros_interface": plan.policy.access.value},
         "on_violation": _consequences(plan.on_violation),
         "modes": {
@@ -112,8 +107,10 @@ def _document(plan: Plan) -> _Tree:
         },
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
-                name: to_plain(getattr(flow, name))
-                for name in ("unique", "max_delay_ms", "transport")
+                "unique": flow.unique.value,
+                "transport": flow.transport.value,
+                **_numbers(flow.quantities),
+                **({"measure": True} if flow.measure else {}),
             }
             for flow in plan.flows
             if flow.linked
@@ -163,8 +160,9 @@ def _node(node: PlannedNode) -> _Tree:
 
 
 def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
-    run = {name: value for name, value in _fields(node.run, *_RUN_SPELLED).items() if value}
-    run = run or {node.run.kind.value: True}
+    spelled = ("kind", "environment", "working_directory", "arguments", "executor")
+    plain = _fields(node.run, *spelled, "extra_arguments")
+    run = {name: value for name, value in plain.items() if value} or {node.run.kind.value: True}
     if node.run.kind is RunKind.PYTHON:
         run["arguments"] = _plain(node.run.arguments)
         run["executor"] = node.run.executor.value
@@ -207,6 +205,7 @@ def _flows(node: PlannedNode) -> _Tree:
             for name in _FLOW
             if getattr(each, name) != _NOT_ASKED[name]
         }
+        asked.update(_numbers(each.quantities))
         if each.five_qi_reason:  # proposed for what is declared
             asked.pop("dscp", None)
             asked["five_qi"] = "auto"
@@ -216,6 +215,17 @@ def _flows(node: PlannedNode) -> _Tree:
             asked["non_blocking_send"] = True
         found.setdefault(each.kind.value, {})[each.name] = asked
     return found
+
+
+def _numbers(quantities: Iterable[Quantity]) -> dict[str, object]:
+    """Return numbers by their keys; those of several links on one pair are a list."""
+    found: dict[str, list[object]] = {}
+    for each in quantities:
+        plain = each.value if each.most is None else str(each).removeprefix(f"{each.name} ")
+        found.setdefault(each.name, []).append(plain)
+        if each.quantile != QUANTILE:
+            found.setdefault("quantile", []).append(each.quantile)
+    return {name: each[0] if len(each) == 1 else each for name, each in found.items()}
 
 
 _NOT_ASKED = {each.name: each.default for each in msgspec.structs.fields(PlannedEndpoint)}
@@ -253,10 +263,6 @@ def _shown(value: object, absent: str) -> str:
     return text if len(text) <= _VALUE_CHARACTERS else f"{text[: _VALUE_CHARACTERS - 1]}…"
 
 
-def _node_of(path: _Path) -> str:
-    return path[1] if path[0] == "nodes" and len(path) > 1 else ""
-
-
 def _positions(plan: Plan) -> dict[_Path, Position]:
     found: dict[_Path, Position] = {}
     for node in plan.nodes:
@@ -269,10 +275,8 @@ def _positions(plan: Plan) -> dict[_Path, Position]:
 
 def _at(path: _Path, places: Mapping[_Path, Position]) -> Position | None:
     """Return the position of the innermost part of `path` that has one."""
-    for length in range(len(path), 0, -1):
-        if path[:length] in places:
-            return places[path[:length]]
-    return None
+    inner = (path[:length] for length in range(len(path), 0, -1))
+    return next((places[each] for each in inner if each in places), None)
 
 
 MAX_TEXT = 1 << 20
@@ -288,13 +292,10 @@ class PlanNotice(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         run: one run of it, unique.
-        host: its machine id, see node.machine_id.
-        system: name of the system.
+        host: its machine id.
         machines: those whose nodes it brings up.
         nodes: fully qualified names of all nodes of the plan.
-        checksum: of what is planned, see comparison.plan_checksum.
-        left: it is being shut down, or has been.
-        reason: why; empty unless it left.
+        left: it is being shut down, or has been, for this reason.
     """
 
     run: str
@@ -361,12 +362,8 @@ def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:
 
     Two systems may share a domain and their hosts, and even a name where each has machines of its
     own. But our system has one supervisor per machine, and a domain one node of a name: who runs
-    another machine of our system is concerned, and who plans a node that we plan.
-
-    Args:
-        plan: ours.
-        own: machines whose nodes we bring up.
-        notice: what the other supervisor announces.
+    another machine of our system is concerned, and who plans a node that we plan. `own` are the
+    machines whose nodes we bring up.
     """
     theirs = {each.machine for each in plan.nodes} - own - {""}
     if notice.system == plan.system and not theirs.isdisjoint(notice.machines):
@@ -379,11 +376,9 @@ _MOST_LINES = 20
 
 def difference_lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     """Phrase differences with their places in the new manifest, at most 20 of them."""
-    every = tuple(found)
-    lines = []
-    for each in every[:_MOST_LINES]:
-        place = f"{each.at.spelled}: " if each.at else ""
-        lines.append(f"{place}{each.path}: was {each.old}, is {each.new}")
-    if len(every) > _MOST_LINES:
-        lines.append(f"and {len(every) - _MOST_LINES} more")
-    return tuple(lines)
+    lines = [
+        f"{f'{each.at.spelled}: ' if each.at else ''}{each.path}: was {each.old}, is {each.new}"
+        for each in found
+    ]
+    more = len(lines) - _MOST_LINES
+    return (*lines[:_MOST_LINES], *([f"and {more} more"] if more > 0 else []))

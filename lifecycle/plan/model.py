@@ -44,10 +44,6 @@ def declared(as_: type, by: object) -> dict[str, Any]:
 
     A plan's types extend those of the manifest, so that what is declared is written down once, and
     JSON of a plan has it beside what was planned.
-
-    Args:
-        as_: the manifest's type.
-        by: a value of it, or of a type that extends it.
     """
     return {each.name: getattr(by, each.name) for each in msgspec.structs.fields(as_)}
 
@@ -143,9 +139,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
 
     Attributes:
         resolved: fully qualified topic, service or action name after namespace and remap.
-        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
-            declared.
-        rate_hz: messages per second, > 0; None if not declared.
         transport: NETWORK must not go by shared memory.
         lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
             the QoS and to the node's own hint, which this overrides.
@@ -163,8 +156,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
 
     resolved: str
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    loss: float | None = None
-    rate_hz: float | None = None
     transport: FlowTransport = FlowTransport.ANY
     lossy: bool | None = None
     quantities: tuple[Quantity, ...] = ()
@@ -357,14 +348,12 @@ class PlannedServer(msgspec.Struct, frozen=True, kw_only=True):
         address: given to clients, and listened on.
         port: 1–65535.
         tcp: over TCP; else UDP.
-        prefix: its GUID prefix, as in connection URLs.
     """
 
     machine: str
     address: str
     port: Port
     tcp: bool = True
-    prefix: str
 
 
 class Plan(SystemDeclaration, frozen=True, kw_only=True):

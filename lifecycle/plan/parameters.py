@@ -14,6 +14,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from lifecycle.manifest.checks.parameters import (
     CommandParameter,
     command_line_parameters,
@@ -21,7 +23,7 @@ from lifecycle.manifest.checks.parameters import (
     misfit,
 )
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
+from lifecycle.manifest.model import Mode, Node, ParameterDeclaration, ParameterValue
 from lifecycle.manifest.parameter_files import ParameterFiles, type_of
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
@@ -42,12 +44,7 @@ class _Given(NamedTuple):
 
 
 class NodeParameters:
-    """What parameters the nodes of one manifest must have.
-
-    Args:
-        files: that its nodes name.
-        modes: of that manifest.
-    """
+    """What parameters the nodes of one manifest must have, by its files and in its modes."""
 
     def __init__(self, files: ParameterFiles, modes: tuple[Mode, ...] = ()) -> None:
         self._files = files
@@ -59,23 +56,26 @@ class NodeParameters:
         declared = tuple(
             _declared(each, given.pop(each.name, None)) for each in node.interface.parameters
         )
-        undeclared = (_undeclared(name, each) for name, each in given.items())
-        return (*declared, *(each for each in undeclared if each is not None))
+        undeclared = (
+            _expected(name, type_of(each.value), each)
+            for name, each in given.items()
+            if each.value is not None
+        )
+        return (*declared, *undeclared)
 
     def in_modes(
         self, node: Node, expected: tuple[ExpectedParameter, ...]
     ) -> tuple[ModeParameters, ...]:
-        """Return what those parameters of a node are in each mode that some mode sets.
-
-        Args:
-            node: of the manifest.
-            expected: what `expected` returns of it.
-        """
+        """Return what the parameters that some mode sets are in each mode."""
         known = {each.name: each for each in expected}
         types = {each.name: each.type for each in node.interface.parameters}
         found = {
             mode.name: {
-                each.name: _in_mode(mode.name, each, types.get(each.name, ""))
+                each.name: _expected(
+                    each.name,
+                    types.get(each.name) or type_of(each.value),
+                    _Given(each.value, f"mode {mode.name}", optional=False, at=each.at),
+                )
                 for each in mode.parameters
                 if each.node == node.key
             }
@@ -137,37 +137,18 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
         default = as_type(declaration.default, type_)
         if not misfit(default, type_):
             given = _Given(default, DEFAULT, optional=False, at=declaration.at)
-    return ExpectedParameter(
-        name=declaration.name,
-        type=type_,
-        value=None
-        if given is None or given.value is None
-        else portable(as_type(given.value, type_)),
-        source="" if given is None or given.value is None else given.source,
-        read_only=declaration.read_only,
-        at=declaration.at if given is None else given.at,
-    )
+    if given is None:
+        given = _Given(None, "", optional=False, at=declaration.at)
+    found = _expected(declaration.name, type_, given)
+    return replace(found, read_only=declaration.read_only, optional=False)
 
 
-def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
-    type_ = type_ or type_of(given.value)
-    return ExpectedParameter(
-        name=given.name,
-        type=type_,
-        value=portable(as_type(given.value, type_)),
-        source=f"mode {mode}",
-        at=given.at,
-    )
-
-
-def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
-    if given.value is None:
-        return None
+def _expected(name: str, type_: str, given: _Given) -> ExpectedParameter:
     return ExpectedParameter(
         name=name,
-        type=type_of(given.value),
-        value=portable(given.value),
-        source=given.source,
+        type=type_,
+        value=None if given.value is None else portable(as_type(given.value, type_)),
+        source="" if given.value is None else given.source,
         optional=given.optional,
         at=given.at,
     )

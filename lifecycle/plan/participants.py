@@ -49,12 +49,6 @@ def place(
     Names of the latter count from 0 in the order in which the interface first needs them, so they
     are the same in every run. What is in no connection and no group is left alone.
 
-    Args:
-        node_name: the node's base name.
-        endpoints: all of the node's endpoints, in the interface's order.
-        connections: that the manifest declares for the node.
-        groups: endpoints that share a participant, as `FlowNeeds.groups` makes them.
-
     Returns:
         The endpoints with `participant` filled in, and the participants, connections first.
     """
@@ -128,14 +122,10 @@ def _reason(group: ParticipantGroup) -> str:
 
 
 def command_line(nodes: Sequence[Node], environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the full argv of a COMMAND process.
+    """Return the full argv of a COMMAND process, whose nodes share one `run:`.
 
     It is given ROS arguments only where a key of one of its nodes asks for them. Those of a process
     with several nodes are for the one node alone; who is to be renamed is known by its key.
-
-    Args:
-        nodes: all of the process, one or more, which share one `run:`.
-        environment: where AMENT_PREFIX_PATH is looked up.
 
     Raises:
         PlanError: the package or its executable cannot be found.
@@ -185,18 +175,16 @@ def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -
     """
     prefixes = search_prefixes(environment)
     wanted = f"executable {run.executable!r} of package {run.package!r}"
-    found: list[str] = []
+    found: set[str] = set()
     for prefix in prefixes:
         folder = prefix / "lib" / run.package
         candidate = folder / run.executable
         if os.path.isfile(candidate) and os.access(candidate, os.X_OK):
             return str(candidate)
         if os.path.isdir(folder):
-            found += [each.name for each in folder.iterdir() if os.access(each, os.X_OK)]
+            found |= {each.name for each in folder.iterdir() if os.access(each, os.X_OK)}
     if found:
-        raise PlanError(
-            f"cannot find {wanted}: the package has {', '.join(sorted(set(found)))}", at=at
-        )
+        raise PlanError(f"cannot find {wanted}: the package has {', '.join(sorted(found))}", at=at)
     raise PlanError(
         f"cannot find {wanted}: no lib/{run.package} with executables under "
         f"{', '.join(map(str, prefixes))}",

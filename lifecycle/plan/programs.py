@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
@@ -38,7 +38,6 @@ from lifecycle.plan.python_source import (
 RULE = "program.missing"
 UNHANDLED = "program.handler"
 UNDECLARED = "program.endpoint"
-IMMOVABLE = "program.connection"
 NO_HEALTH = "program.health"
 IMPORT = "program.import"
 UNCALLED = "program.callback"
@@ -49,7 +48,6 @@ _WORDS = {
     EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
     EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
 }
-_OF_RCLPY = (ClassKind.MANAGED, ClassKind.PLAIN)
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
@@ -72,12 +70,7 @@ class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Resolution(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of looking for everything that a manifest runs.
-
-    Attributes:
-        diagnostics: what would fail, in the order of the manifest.
-        unresolved: what could not be decided, likewise.
-    """
+    """What of everything that a manifest runs would fail, and what could not be decided."""
 
     diagnostics: tuple[Diagnostic, ...] = ()
     unresolved: tuple[UnresolvedProgram, ...] = ()
@@ -106,13 +99,7 @@ def resolve_programs(
     found = [
         each
         for node in manifest.nodes
-        for each in _look(
-            node,
-            read,
-            environment=environment,
-            authority=manifest.data_layer.authority,
-            ours=is_ours(node.machine),
-        )
+        for each in _look(node, read, environment, ours=is_ours(node.machine))
     ]
     return Resolution(
         diagnostics=tuple(each for each in found if isinstance(each, Diagnostic)),
@@ -122,28 +109,15 @@ def resolve_programs(
 
 _Found = Diagnostic | UnresolvedProgram
 _Read = Callable[[tuple[str, ...], str, str], NodeClass]
+"""Returns the class of a name in a module, which is looked for in some folders first."""
 
 
 def _look(
-    node: Node,
-    read: _Read,
-    *,
-    environment: Mapping[str, str],
-    authority: Authority,
-    ours: bool,
+    node: Node, read: _Read, environment: Mapping[str, str], *, ours: bool
 ) -> Iterator[_Found]:
-    """Look for what one node runs.
-
-    Args:
-        node: the node.
-        read: returns the class of a name in a module that is looked for in folders first.
-        environment: as for resolve_programs.
-        authority: of the data layer.
-        ours: its machine is this host.
-    """
     run = node.run
     if run.kind is RunKind.PYTHON:
-        yield from _python(node, read, authority=authority, ours=ours)
+        yield from _python(node, read, ours=ours)
     elif run.kind is RunKind.COMMAND:
         part, subject = "run.command", f"program {run.command[0]!r}" if run.command else ""
         if not run.command:
@@ -172,7 +146,7 @@ def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ou
     return UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
-def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Iterator[_Found]:
+def _python(node: Node, read: _Read, *, ours: bool) -> Iterator[_Found]:
     subject = f"class {node.run.python!r}"
     at = _at(node, "run.python")
     module, separator, name = node.run.python.partition(":")
@@ -199,8 +173,6 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
         )
         return
     yield from _called(node, found, at)
-    if found.kind in _OF_RCLPY:
-        yield from _immovable(node, found, at, authority)
     yield from _without_health(node, found)
     yield from _slips(node, found, at, ours=ours)
     yield from _interface(node, found, at, subject)
@@ -246,7 +218,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         yield error(
             RULE,
             at,
-            f"cannot manage {node.key!r}: {found.name} ({found.file or 'rclpy'}) is a plain node",
+            f"cannot manage {node.key!r}: {found} is a plain node",
             "write 'managed: false'; it is held by its executor until the system is verified",
         )
     arguments = dict(node.run.arguments)
@@ -257,7 +229,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
                 yield error(
                     RULE,
                     where,
-                    f"cannot give {found.name} ({found.file}) an argument {name!r}",
+                    f"cannot give {found} an argument {name!r}",
                     did_you_mean(name, found.takes)
                     or f"it takes {', '.join(found.takes) or 'none'}",
                 )
@@ -267,47 +239,20 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         yield error(
             RULE,
             where,
-            f"cannot call {found.name} ({found.file}) without {', '.join(missing)}",
+            f"cannot call {found} without {', '.join(missing)}",
             "give it under 'run: {arguments: …}'",
         )
-
-
-def _immovable(
-    node: Node, found: NodeClass, at: Position, authority: Authority
-) -> Iterator[Diagnostic]:
-    """Yield what is asked of the connections of a node whose endpoints its own code makes."""
-    what = f"{found.name} ({found.file or 'rclpy'})"
-    if authority is Authority.SUPERVISOR and node.managed:
-        yield error(
-            IMMOVABLE,
-            at,
-            f"cannot leave the connections of {node.key!r} to the supervisor: {what} is not "
-            "a lifecycle.LifecycleNode, and makes its endpoints itself",
-            "derive it from lifecycle.LifecycleNode, or use 'data_layer: {authority: nodes}'",
-        )
-    for connection in node.connections:
-        for kind, name in connection.map:
-            if not kind.is_topic:
-                yield error(
-                    IMMOVABLE,
-                    connection.at,
-                    f"cannot map {kind.noun} {name!r} of {node.key!r} to connection "
-                    f"{connection.name!r}: {what} is not a lifecycle.LifecycleNode, and only its "
-                    "topics can be placed",
-                    "derive it from lifecycle.LifecycleNode, or leave it out of 'map'",
-                )
 
 
 def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
     """Yield that a node is to be asked for its health whose class has nothing to ask."""
     if node.health is None or not node.health.check or not node.managed:
         return
-    what = f"{found.name} ({found.file or 'rclpy'})"
-    if found.kind in _OF_RCLPY:
+    if found.kind in (ClassKind.MANAGED, ClassKind.PLAIN):
         yield error(
             NO_HEALTH,
             node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {what} is not a "
+            f"cannot ask {node.key!r} whether it is healthy: {found} is not a "
             "lifecycle.LifecycleNode",
             "derive it from lifecycle.LifecycleNode, or write 'health: {diagnostics: NAME}'",
         )
@@ -315,7 +260,7 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
         yield error(
             NO_HEALTH,
             node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {what} has no method 'health'",
+            f"cannot ask {node.key!r} whether it is healthy: {found} has no method 'health'",
             "give it 'def health(self)', which returns None if all is well and else what is "
             "wrong, or write 'health: {diagnostics: NAME}'",
         )
@@ -394,8 +339,8 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
             yield error(
                 UNHANDLED,
                 endpoint.at,
-                f"cannot serve {noun} {name!r}: no method of {found.name} ({found.file}) is "
-                f"decorated with {decorator}({name!r})",
+                f"cannot serve {noun} {name!r}: no method of {found} is decorated with "
+                f"{decorator}({name!r})",
             )
 
 

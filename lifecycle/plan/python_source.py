@@ -142,6 +142,9 @@ class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
     uncalled: tuple[Slip, ...] = ()
     missing: tuple[Slip, ...] = ()
 
+    def __str__(self) -> str:
+        return f"{self.name} ({self.file or 'rclpy'})"
+
 
 class _Module(msgspec.Struct):
     """A module's source; `bound` holds the top statements that bind a name, anywhere inside."""
@@ -174,11 +177,7 @@ class _Definition(msgspec.Struct, frozen=True):
 
 
 class Sources:
-    """Modules as one process would find them.
-
-    Args:
-        folders: looked in first, as `python -m` looks in its working directory.
-    """
+    """Modules as one process would find them, which looks first in some folders."""
 
     def __init__(self, folders: Sequence[str]) -> None:
         self._folders = tuple(folders)
@@ -216,7 +215,7 @@ class Sources:
         needs: tuple[str, ...] = ()
         constructor = next((each for _, each in methods if each.name == "__init__"), None)
         if constructor and not unknown:
-            takes, needs = _arguments(constructor.args, but_first=True)
+            takes, needs = _arguments(constructor.args, is_method=True)
         kind = next((each for each in _NODES if each.value in known), ClassKind.NO_NODE)
         if unknown and kind in (ClassKind.PLAIN, ClassKind.NO_NODE):
             kind = ClassKind.UNKNOWN
@@ -265,9 +264,7 @@ class Sources:
     def _has(self, package: str) -> bool:
         try:
             self._locate(package)
-        except UnknownError:
-            return True
-        except NotThereError as problem:
+        except (NotThereError, UnknownError) as problem:
             return not problem.message.startswith("cannot find module")
         return True
 
@@ -487,22 +484,14 @@ def _known(dotted: str) -> str:
 
 
 def _arguments(
-    given: ast.arguments, *, but_first: bool = False
+    given: ast.arguments, *, is_method: bool = False
 ) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
-    """Return the keywords that a function takes, None for any, and those that it needs.
-
-    Args:
-        given: its arguments.
-        but_first: it is a method: the first one is not given.
-    """
+    """Return the keywords that a function takes, None for any, and those that it needs."""
     positional = [each.arg for each in (*given.posonlyargs, *given.args)]
+    keywords = zip(given.kwonlyargs, given.kw_defaults, strict=True)
     needs = positional[: len(positional) - len(given.defaults)]
-    needs += [
-        each.arg
-        for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)
-        if default is None
-    ]
-    own = positional[:1] if but_first else []
+    needs += [each.arg for each, default in keywords if default is None]
+    own = positional[:1] if is_method else []
     takes = tuple(each.arg for each in (*given.args, *given.kwonlyargs) if each.arg not in own)
     return None if given.kwarg else takes, tuple(each for each in needs if each not in own)
 

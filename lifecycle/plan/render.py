@@ -12,16 +12,13 @@ from lifecycle.manifest.model import (
     DataLayer,
     DataLayerSource,
     DiscoveryMode,
-    EndpointKind,
     FlowTransport,
     RunKind,
     UniqueHow,
 )
 from lifecycle.manifest.qos import BEST_AVAILABLE_NS, History, Liveliness, QosProfile
-from lifecycle.network.connection_url import parse
 from lifecycle.network.dscp import describe
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.ports import participant_ports, unique_flow_ports
 from lifecycle.plan.model import (
     HeldBy,
     ParticipantConnections,
@@ -32,10 +29,8 @@ from lifecycle.plan.model import (
 )
 from lifecycle.printable import columns, count
 
-RMW_CHOOSES = "as the RMW chooses"
 
-
-def data_layer(plan: Plan, width: int) -> list[str]:
+def _data_layer(plan: Plan, width: int) -> list[str]:
     """Describe how participants find each other and who connects them; nothing if all is usual."""
     rows: list[tuple[str, str]] = []
     mode, transport = plan.discovery.mode, plan.discovery.transport
@@ -60,7 +55,7 @@ def data_layer(plan: Plan, width: int) -> list[str]:
     return columns(rows, indent=2, width=width)
 
 
-def connections(plan: Plan, width: int) -> list[str]:
+def _connections(plan: Plan, width: int) -> list[str]:
     """List each node's participants with their URLs and what they carry."""
     lines: list[str] = []
     for node in plan.nodes:
@@ -82,7 +77,7 @@ def connections(plan: Plan, width: int) -> list[str]:
 
 
 def _spelled(each: ParticipantConnections) -> list[str]:
-    texts = list(each.urls) or [RMW_CHOOSES]
+    texts = list(each.urls) or ["as the RMW chooses"]
     if each.static_name:
         texts.append(f"known to others as {each.static_name}, without being told")
     if each.super_client:
@@ -90,7 +85,7 @@ def _spelled(each: ParticipantConnections) -> list[str]:
     return texts
 
 
-def participants(plan: Plan, width: int) -> list[str]:
+def _participants(plan: Plan, width: int) -> list[str]:
     """List extra participants."""
     rows = [
         (f"{node.namespace.rstrip('/')}/{each.name}", each.reason)
@@ -101,25 +96,19 @@ def participants(plan: Plan, width: int) -> list[str]:
 
 
 def render_text(plan: Plan, *, width: int = 100) -> str:
-    """Print processes, order, nodes with endpoints, extra participants, flows and ports.
+    """Print processes, order, nodes with endpoints, extra participants and flows.
 
-    Args:
-        plan: what to print.
-        width: columns to fit into where words allow it, >= 40.
-
-    Returns:
-        Lines, each ended by a newline.
+    Lines fit into `width` columns, at least 40, where words allow it.
     """
     width = max(width, 40)
     sections: tuple[tuple[str, Callable[[Plan, int], list[str]]], ...] = (
         ("processes", _processes),
         ("order", _order),
-        ("data layer", data_layer),
+        ("data layer", _data_layer),
         ("nodes", _nodes),
-        ("connections", connections),
-        ("extra participants", participants),
+        ("connections", _connections),
+        ("extra participants", _participants),
         ("flows", _flows),
-        ("ports, if participants start in this order and none is taken", _ports),
     )
     lines = [_headline(plan)]
     for title, section in sections:
@@ -284,73 +273,3 @@ def _flows(plan: Plan, width: int) -> list[str]:
         told = filter(None, (by, ", ".join(needs)))
         rows.append((flow.topic, ends, "; ".join(told)))
     return columns(rows, indent=2, width=width)
-
-
-def _ports(plan: Plan, width: int) -> list[str]:
-    """List the participants of each host with their ports: planned, else by the DDS formula.
-
-    A busy port is replaced when it is bound, so the real ones are read from the running system. A
-    process that others start is counted with one participant, the least it can have.
-    """
-    addresses = {each.name: each.address for each in plan.machines}
-    observers = {addresses.get(machine, ""): each.urls for machine, each in plan.observers}
-    hosts: dict[str, list[PlannedProcess]] = {}
-    for process in plan.processes:
-        hosts.setdefault(addresses.get(process.machine, ""), []).append(process)
-    lines: list[str] = []
-    for host, processes in hosts.items():
-        machines = dict.fromkeys(each.machine for each in processes if each.machine)
-        lines += [f"  machine {', '.join(machines)}"] * bool(machines)
-        owners = [("supervisor", observers.get(host, ()))]
-        unique = 0
-        for process in processes:
-            nodes = [plan.node(key) for key in process.nodes]
-            # The nodes of a process share a participant if they ask for the same.
-            owners += dict.fromkeys(
-                (_owner(process, each), each.connections.urls) for each in nodes
-            )
-            owners += [
-                (f"{node.namespace.rstrip('/')}/{each.name}", each.connections.urls)
-                for node in nodes
-                for each in node.participants
-            ]
-            ours = process.run.kind is RunKind.PYTHON
-            unique += sum(
-                ours and each.kind is EndpointKind.SUBSCRIPTION and each.unique.asks
-                for node in nodes
-                for each in node.endpoints
-            )
-        rows = [
-            (str(index), owner, _ports_of(plan.domain_id, index, urls))
-            for index, (owner, urls) in enumerate(owners)
-        ]
-        lines += columns(rows, indent=4, width=width)
-        if unique:
-            first, *_, last = unique_flow_ports()
-            subscriptions = count(unique, "unique subscription")
-            lines.append(f"    {subscriptions}: the first free of {first}–{last}")
-    return lines
-
-
-def _owner(process: PlannedProcess, node: PlannedNode) -> str:
-    facts: list[str] = [*node.transports]
-    if node.max_datagram_bytes is not None:
-        facts.append(f"{node.max_datagram_bytes} bytes")
-    return f"{process.name} ({', '.join(facts)})" if facts else process.name
-
-
-def _ports_of(domain_id: int, index: int, urls: tuple[str, ...]) -> str:
-    parsed = [parse(text) for text in urls]
-    if parsed and not any(each.transport.is_network for each in parsed):
-        return "none: shared memory alone"
-    # A group's port is the group's, not the participant's.
-    own = (each for each in parsed if not each.transport.is_group)
-    for each in own:
-        if each.metatraffic_port or each.port:  # TCP has one port for both
-            discovery, user = each.metatraffic_port or each.port, each.port or each.metatraffic_port
-            return f"discovery {discovery}, user {user}"
-    try:
-        ports = participant_ports(domain_id, index)
-    except ValueError:  # beyond 65535; `lifecycle check` explains
-        return "no port left in this domain"
-    return f"discovery {ports.discovery_unicast}, user {ports.user_unicast}"

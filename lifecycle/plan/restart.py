@@ -17,6 +17,7 @@ from types import MappingProxyType
 from msgspec.structs import replace
 
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.ports import MAX_PORT
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
 from lifecycle.plan.negotiation.parties import hosts_of, terms_of
@@ -32,7 +33,6 @@ Reported = Mapping[str, Mapping[str, tuple[str, ...]]]
 """What nodes report as their connections: full node name → connection, empty for the node's own
 participant → URLs."""
 
-_LAST_PORT = 65535
 _NOTHING: Reported = MappingProxyType({})
 
 _Place = tuple[str, str]
@@ -45,7 +45,6 @@ _Listener = tuple[str, ConnectionUrl]
 
 
 def _peer(listener: _Listener) -> Peer:
-    """Return where it is dialled."""
     host, url = listener
     return contacts_of(host, (str(url),))[0].peer
 
@@ -111,20 +110,15 @@ def moved_observer(
 ) -> ParticipantConnections:
     """Return how an observer is connected on a TCP port that it never had.
 
-    Only a discovery server need know that port.
-
-    Args:
-        plan: of its system.
-        connections: how it was planned.
-        number: of the try, from 0.
+    Only a discovery server need know that port. `number` counts the tries from 0.
 
     Raises:
         PlanError: there is no such port.
     """
     port = plan.discovery.first_port + OBSERVER_PORTS_FROM + number
-    if port > _LAST_PORT:
+    if port > MAX_PORT:
         raise PlanError(
-            f"cannot give the supervisor's participant port {port}: the highest is {_LAST_PORT}",
+            f"cannot give the supervisor's participant port {port}: the highest is {MAX_PORT}",
             hint="lower 'discovery.first_port'",
         )
     urls = tuple(
@@ -149,12 +143,8 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
     """Whether a participant that was planned with one URL has the other because of a restart.
 
     Another host's supervisor restarts its nodes without notice, and to an observing command so
-    does ours. Which peers there were then cannot be known afterwards.
-
-    Args:
-        planned: a connection URL.
-        reported: likewise.
-        first_port: first of the ports that the plan gives out.
+    does ours. Which peers there were then cannot be known afterwards. `first_port` is the first of
+    the ports that the plan gives out.
 
     Raises:
         ConnectionUrlError: one of them is none.
@@ -203,8 +193,7 @@ def _on_next_port(
     """
     host, url = now
     listeners = [each for each, (other, _) in original.items() if each[0] and other == host]
-    taken = {each: set(ports) for each, ports in terms_of(first).taken}
-    pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, taken)
+    pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, terms_of(first).taken)
     mine, had = listeners.index(place), url.port or 0
     port = pool.take(host, len(listeners))[mine]
     if had != original[place][1].port:

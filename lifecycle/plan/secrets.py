@@ -7,13 +7,16 @@ and the processes that it starts, on a terminal, on disk or on the network, goes
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from typing import TypeVar
 
 from msgspec.structs import replace
 
-from lifecycle.plan.model import Plan
+from lifecycle.manifest.model import Run
+from lifecycle.plan.model import Plan, PlannedProcess
 
 REDACTED = "(redacted)"
+
+_Started = TypeVar("_Started", Run, PlannedProcess)
 
 _SECRET = re.compile(
     "TOKEN|SECRET|PASSW|PASSPHRASE|(^|_)PASS(_|$)|_PWD$|CREDENTIAL|PRIVATE|COOKIE"
@@ -34,33 +37,12 @@ def shown(variable: str, value: str) -> str:
 
 def without_secrets(plan: Plan) -> Plan:
     """Return `plan` without values of environment variables whose names say they are secret."""
-    nodes = tuple(
-        replace(
-            node,
-            run=replace(node.run, environment=_redacted(node.run.environment)),
-        )
-        if _has_secrets(node.run.environment)
-        else node
-        for node in plan.nodes
-    )
-    processes = tuple(
-        replace(
-            process,
-            environment=_redacted(process.environment),
-            run=replace(process.run, environment=_redacted(process.run.environment)),
-        )
-        if _has_secrets((*process.environment, *process.run.environment))
-        else process
-        for process in plan.processes
-    )
-    if nodes == plan.nodes and processes == plan.processes:
-        return plan
+    nodes = tuple(replace(each, run=_redacted(each.run)) for each in plan.nodes)
+    processes = tuple(replace(_redacted(each), run=_redacted(each.run)) for each in plan.processes)
     return replace(plan, nodes=nodes, processes=processes)
 
 
-def _has_secrets(variables: Iterable[tuple[str, str]]) -> bool:
-    return any(shown(name, value) != value for name, value in variables)
-
-
-def _redacted(variables: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    return tuple((name, shown(name, value)) for name, value in variables)
+def _redacted(of: _Started) -> _Started:
+    return replace(
+        of, environment=tuple((name, shown(name, value)) for name, value in of.environment)
+    )

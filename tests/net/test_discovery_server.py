@@ -22,7 +22,6 @@ from tests.net.nine_systems import DOMAIN
 from tests.ros.supervisor.contacts import TRIES
 from tests.ros.supervisor.running import BOUND_S
 
-_PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
 _PORT = 8800
 
 
@@ -64,7 +63,7 @@ class _Participant:
 @contextlib.contextmanager
 def _served(left: Host, right: Host, runtime: Path) -> Iterator[list[_Participant]]:
     """A participant on each host, by a discovery server on the left one."""
-    server = PlannedServer(machine="left", address=left.ipv4, port=_PORT, prefix=_PREFIX)
+    server = PlannedServer(machine="left", address=left.ipv4, port=_PORT)
     argv, environment = discovery_server_command(server)
     running = left.popen(*argv, env={**os.environ, **environment}, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + BOUND_S

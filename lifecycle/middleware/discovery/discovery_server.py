@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
 import sysconfig
 from collections.abc import Mapping
@@ -21,9 +20,6 @@ from lifecycle.network.medium import DEFAULT_TCP, RMW_DISCOVERY, TRANSPORTS_VARI
 from lifecycle.plan.model import PlannedServer
 
 PROGRAM = "fast-discovery-server"
-_PREFIX = re.compile(r"44\.53\.([0-9a-f]{2})\.5f\.45\.50\.52\.4f\.53\.49\.4d\.41")
-"""The GUID prefixes that the program can take: only the third byte can be chosen."""
-
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 
 
@@ -33,21 +29,15 @@ def discovery_server_command(
     """Return the command line of a discovery server, and the whole environment it needs.
 
     Args:
-        server: address, port, transport and GUID prefix; the address must be this host's.
+        server: address, port and transport; the address must be this host's.
         environment: what it otherwise gets; None for this process's.
 
     Raises:
-        MiddlewareError: the program is not installed, or cannot have that prefix.
+        MiddlewareError: the program is not installed.
     """
-    found = _PREFIX.fullmatch(server.prefix.lower())
-    if found is None:
-        raise MiddlewareError(
-            f"cannot start a discovery server with GUID prefix {server.prefix!r}: allowed is "
-            "'44.53.XX.5f.45.50.52.4f.53.49.4d.41', XX the server's id in hex"
-        )
     options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
     command = (_program(), *installed().server_arguments)
-    argv = (*command, "-i", str(int(found.group(1), 16)), *options, str(server.port))
+    argv = (*command, "-i", "0", *options, str(server.port))  # the id that clients expect
     current = dict(os.environ if environment is None else environment)
     # A profile or a server of the environment's would be applied to the server itself.
     for variable in (

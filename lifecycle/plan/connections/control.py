@@ -34,9 +34,6 @@ from lifecycle.plan.model import (
     PlannedServer,
 )
 
-DEFAULT_PREFIX = ConnectionUrl(transport=DEFAULT_TCP).server_prefix
-_FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
-
 
 class Control(msgspec.Struct, frozen=True, kw_only=True):
     """The control plane of a system.
@@ -76,7 +73,7 @@ def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
 
 def is_fixed(discovery: Discovery) -> bool:
     """Whether participants have planned ports and find only planned peers."""
-    return discovery.mode in _FIXED
+    return discovery.mode in (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
 def connect_control(
@@ -84,13 +81,8 @@ def connect_control(
 ) -> tuple[tuple[PlannedNode, ...], Control]:
     """Connect own participants, extra ones without connection, and observers.
 
-    Args:
-        nodes: of the whole system; a participant of a declared connection has its URLs
-            already and is left alone, and so are all extra ones where endpoints are static: they
-            carry data and become connections (`static_endpoints`).
-        discovery: as declared.
-        hosts: of the system.
-        pool: what is left of each host's ports.
+    A participant of a declared connection has its URLs already and is left alone, and so are all
+    extra ones where endpoints are static: they carry data and become connections (`place_static`).
 
     Returns:
         The nodes with `connections` filled in, and what the rest of the plan must know.
@@ -104,11 +96,13 @@ def connect_control(
         tcp = transport.medium is not None and transport.medium.is_tcp
         server = _server(discovery, hosts, pool, tcp=tcp)
     ports = {host: pool.take(host, 4) for host in hosts.used}
+    control = Control(
+        transport=transport,
+        server=server,
+        observers=dict.fromkeys(hosts.used, ParticipantConnections()),
+        observer_ports=ports,
+    )
     if transport is FlowTransport.ANY:
-        nobody = dict.fromkeys(hosts.used, ParticipantConnections())
-        control = Control(
-            transport=transport, server=server, observers=nobody, observer_ports=ports
-        )
         return tuple(nodes), control
     (kind,) = transport.media
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and kind.is_network
@@ -134,8 +128,8 @@ def connect_control(
         urls = meshed(slots, kind, hosts, server=server)
 
     def connected(slot: _Slot) -> ParticipantConnections:
-        told = server is not None and slot[0] == "observer"
-        return ParticipantConnections(urls=(urls[slot],), super_client=told)
+        observes = server is not None and slot[0] == "observer"
+        return ParticipantConnections(urls=(urls[slot],), super_client=observes)
 
     def participant(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
         slot = ("extra", node.key, each.name)
@@ -153,12 +147,7 @@ def connect_control(
         if node.run.kind is RunKind.PYTHON
         else node
         for node in nodes
-    ), Control(
-        transport=transport,
-        server=server,
-        observers={host: connected(("observer", host, "")) for host in hosts.used},
-        observer_ports=ports,
-    )
+    ), replace(control, observers={host: connected(("observer", host, "")) for host in hosts.used})
 
 
 def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) -> PlannedServer:
@@ -169,7 +158,6 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
         address=hosts.address(host),
         port=pool.take(host)[0],
         tcp=tcp,
-        prefix=DEFAULT_PREFIX,
     )
 
 
@@ -189,7 +177,7 @@ def meshed(
         ports: of each participant its host, and its ports as `fixed_url` takes them.
         kind: what all of them are connected by.
         hosts: of the system.
-        server: by which they find each other; None for each looking for all others.
+        server: by which they find each other; None: each looks for all others.
 
     Raises:
         PlanError: a host has no address.
@@ -228,7 +216,7 @@ def connect_observers(
     fixed: bool,
     may_use_tcp: bool = False,
 ) -> dict[str, ParticipantConnections]:
-    """Return how the observer of each host is connected.
+    """Return how the observer of each host is connected; nothing where the RMW may connect it.
 
     Args:
         nodes: with all their connections.
@@ -236,9 +224,6 @@ def connect_observers(
         control: what own participants have.
         fixed: nothing is found by multicast.
         may_use_tcp: connections that are not planned may use TCP.
-
-    Returns:
-        By host; nothing for a host whose observer the RMW may connect.
     """
     urls = [
         (hosts.host(node.machine), parse(text))
@@ -266,8 +251,6 @@ def connect_observers(
     ]
 
     def connected(host: str, base: ParticipantConnections) -> ParticipantConnections:
-        if control.server is not None:
-            return base  # the server announces everything to it
         known = {contact.peer for contact in contacts_of(host, base.urls)}
         wanted = [each for each in contacts if each.peer not in known]
         found = _base_urls(base)
@@ -286,7 +269,9 @@ def connect_observers(
             ),
         )
 
-    observers = {host: connected(host, base) for host, base in control.observers.items()}
+    observers = control.observers
+    if control.server is None:  # else it announces everything to them
+        observers = {host: connected(host, base) for host, base in observers.items()}
     return {host: each for host, each in observers.items() if each.urls}
 
 

@@ -9,6 +9,7 @@ host. Ports are given out in a fixed order, so that equal plans have equal ports
 from __future__ import annotations
 
 import ipaddress
+import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import msgspec
@@ -33,12 +34,7 @@ class Hosts(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, machines: Sequence[Machine], names: Iterable[str]) -> Hosts:
-        """Return the hosts of a system.
-
-        Args:
-            machines: as declared.
-            names: machines that something runs on.
-        """
+        """Return the hosts of a system; `names` are the machines that something runs on."""
         addresses = {each.name: each.address for each in machines}
         return cls(
             machines=tuple(machines),
@@ -59,11 +55,7 @@ class Hosts(msgspec.Struct, frozen=True, kw_only=True):
         return len(self.used) > 1
 
     def address(self, host: str, *, ipv6: bool = False) -> str:
-        """Return what others reach a host by; loopback if it is the only host.
-
-        Args:
-            host: one of `used`.
-            ipv6: which loopback it is.
+        """Return what others reach a host by; loopback, of IPv6 if asked for, of the only host.
 
         Raises:
             PlanError: the host has no address, and others are to reach it.
@@ -99,12 +91,8 @@ class PortPool:
             PlanError: there are none left.
         """
         taken = self._taken.setdefault(host, set())
-        found: list[int] = []
-        for port in range(self._lowest.get(host, self._first), MAX_PORT + 1):
-            if len(found) == count:
-                break
-            if port not in taken:
-                found.append(port)
+        every = range(self._lowest.get(host, self._first), MAX_PORT + 1)
+        found = tuple(itertools.islice((port for port in every if port not in taken), count))
         if len(found) < count:
             what = f"cannot give out {count} more ports{f' on {host}' if host else ''}"
             raise PlanError(
@@ -115,7 +103,7 @@ class PortPool:
             )
         taken.update(found)
         self._lowest[host] = max(found, default=self._first - 1) + 1
-        return tuple(found)
+        return found
 
     def take_everywhere(self, hosts: Sequence[str], first: int) -> int:
         """Give out the lowest port from `first` on that is free on all of these hosts.
@@ -159,28 +147,14 @@ class Contact(msgspec.Struct, frozen=True, kw_only=True, order=True):
 def contacts_of(host: str, urls: Iterable[str]) -> tuple[Contact, ...]:
     """Return where a participant with these URLs is reached; nothing where the RMW chooses."""
     found = []
-    for text in urls:
-        url = parse(text)
-        contact = _contact(host, url)
-        if contact is not None:
-            found.append(contact)
+    for url in map(parse, urls):
+        port = url.port if url.transport.is_tcp else url.metatraffic_port
+        # A group is for data; discovery listens on the interfaces.
+        own = next(iter(url.interfaces), "") if url.transport.is_group else url.address
+        if port is not None:
+            peer = Peer(address=own or host or LOOPBACK, port=port)
+            found.append(Contact(host=host, transport=url.transport.unicast, peer=peer))
     return tuple(found)
-
-
-def _contact(host: str, url: ConnectionUrl) -> Contact | None:
-    address, port = url.address, url.metatraffic_port
-    if url.transport.is_group:
-        # The group is for data; discovery listens on the interfaces.
-        address = next(iter(url.interfaces), "")
-    elif url.transport.is_tcp:
-        port = url.port
-    if port is None:
-        return None
-    return Contact(
-        host=host,
-        transport=url.transport.unicast,
-        peer=Peer(address=address or host or "127.0.0.1", port=port),
-    )
 
 
 def ports_of(urls: Iterable[ConnectionUrl]) -> tuple[int, ...]:
@@ -198,32 +172,22 @@ def ports_of(urls: Iterable[ConnectionUrl]) -> tuple[int, ...]:
 
 
 def peers_by(transport: Medium, contacts: Iterable[Contact], *, host: str) -> tuple[Peer, ...]:
-    """Return the peers that a URL of this transport can look for, sorted, each once.
+    """Return the peers that a URL of this transport, of this host, can look for, sorted.
 
-    Args:
-        transport: of the URL.
-        contacts: all participants to be found.
-        host: of the participant with the URL; a group with TTL 0 reaches no other host.
+    A group with TTL 0 reaches no other host.
     """
-    group = transport.is_group
-    return tuple(
-        sorted(
-            {
-                each.peer
-                for each in contacts
-                if each.transport == transport.unicast and (not group or each.host == host)
-            }
-        )
-    )
+    found = {
+        each.peer
+        for each in contacts
+        if each.transport == transport.unicast and (not transport.is_group or each.host == host)
+    }
+    return tuple(sorted(found))
 
 
 def fixed_url(transport: Medium, address: str, ports: Sequence[int]) -> ConnectionUrl:
     """Return the URL of a participant that only its peers find, as yet without these.
 
-    Args:
-        transport: UDPV4, UDPV6 or TCPV4.
-        address: own.
-        ports: metatraffic, user data and source port for UDP; the listening port for TCP.
+    The ports are those for metatraffic, user data and sending of UDP, the listening port of TCP.
     """
     if transport.is_tcp:
         return ConnectionUrl(transport=transport, address=address, port=ports[0])

@@ -70,6 +70,7 @@ from lifecycle.plan.negotiation.parties import (
     wishes_of,
     written_ports,
 )
+from lifecycle.printable import count
 
 _End = tuple[PlannedNode, PlannedEndpoint]
 
@@ -79,10 +80,7 @@ def infeasible(
 ) -> Iterator[Diagnostic]:
     """Yield what participants are asked for and cannot do.
 
-    Args:
-        nodes: with all connections that are planned.
-        parties: the nodes as negotiation sees them, by key.
-        negotiated: topics are where they will be; else only those on declared connections are.
+    Without `negotiated`, only topics on declared connections are where they will be.
     """
     placed = {
         node.key: replace(parties[node.key], participants=node.participants) for node in nodes
@@ -94,10 +92,6 @@ def infeasible(
             on = party.participant_of(each)
             if negotiated or (on is not None and on.connection):
                 yield from _without_udp(node, each, party.transports_at(each))
-
-
-def _at(node: PlannedNode, each: PlannedEndpoint) -> Position:
-    return each.at or node.at
 
 
 def _services(nodes: Sequence[PlannedNode], parties: Mapping[str, Party]) -> Iterator[Diagnostic]:
@@ -121,7 +115,7 @@ def _services(nodes: Sequence[PlannedNode], parties: Mapping[str, Party]) -> Ite
                     f"{', '.join(theirs)}, and they are on {'one host' if near else 'two hosts'}"
                 )
                 hint = "map both ends onto connections that have a transport in common"
-                yield error("plan.service-apart", _at(node, each), message, hint)
+                yield error("plan.service-apart", each.at, message, hint)
 
 
 def _without_udp(
@@ -136,7 +130,7 @@ def _without_udp(
             f"its participant has {has}, and only UDP sockets can be marked"
         )
         hint = "use 'transport: udpv4', or remove the mark"
-        yield error("plan.mark-without-udp", _at(node, each), message, hint)
+        yield error("plan.mark-without-udp", each.at, message, hint)
     if (
         each.kind is EndpointKind.SUBSCRIPTION
         and each.unique is UniqueRequirement.STRICTLY_REQUIRED
@@ -146,15 +140,11 @@ def _without_udp(
             f"participant has {has}, and only UDP has one port for each subscription"
         )
         hint = "use 'transport: udpv4', or remove 'unique'"
-        yield error("plan.unique-without-udp", _at(node, each), message, hint)
+        yield error("plan.unique-without-udp", each.at, message, hint)
 
 
 def wire(plan: Plan, links: Sequence[Link]) -> Plan:
-    """Connect everything.
-
-    Args:
-        plan: its nodes have their declared connections and the extra participants that flows need.
-        links: of its manifest.
+    """Connect everything, beside declared connections and the extra participants of flows.
 
     Raises:
         PlanError: a pair cannot be connected, a participant cannot do what is asked of it, or there
@@ -214,12 +204,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
 
 
 def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
-    """Return a plan with the connections and media that a data layer graph gives it.
-
-    Args:
-        plan: without negotiated connections.
-        graph: what was negotiated; what it gives to nodes that the plan does not know is left out.
-    """
+    """Return a plan with the connections and media that a data layer graph gives its nodes."""
     connections: dict[str, list[NegotiatedConnection]] = {}
     for each in graph.connections:
         connections.setdefault(each.node, []).append(each)
@@ -242,10 +227,6 @@ def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tu
 
     Only what Fast DDS 2.14 reads from the environment: transports and a discovery server. With
     FASTDDS_BUILTIN_TRANSPORTS other than NONE beside a server, every sample would arrive twice.
-
-    Args:
-        discovery: as declared.
-        server: the discovery server; None without.
     """
     if server is not None:
         at = f"{server.address}:{server.port}"
@@ -294,7 +275,7 @@ def _unconnectable(
     for node in plan.nodes:
         for endpoint in node.endpoints:
             if endpoint.kind is EndpointKind.PUBLISHER:
-                endpoints.setdefault((node.key, endpoint.resolved), _at(node, endpoint))
+                endpoints.setdefault((node.key, endpoint.resolved), endpoint.at)
     for problem in graph.problems:
         link = asked.get((problem.topic, problem.publisher, problem.subscription))
         at = link or endpoints.get((problem.publisher, problem.topic)) or start
@@ -372,12 +353,7 @@ def _place(node: PlannedNode) -> PlannedNode:
     data = PlannedParticipant(
         name=name,
         dscp=None,
-        reason=f"connection {DATA}, "
-        + (
-            "1 endpoint that is not announced"
-            if len(moved) == 1
-            else f"{len(moved)} endpoints that are not announced"
-        ),
+        reason=f"connection {DATA}, {count(len(moved), 'endpoint')} not announced",
         connection=DATA,
     )
     return replace(node, endpoints=endpoints, participants=(*extra, *((data,) if moved else ())))

@@ -45,7 +45,6 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint that must leave its node's own participant.
 
     Attributes:
-        end: how its partners know it.
         transports: what its connection must have, sorted; a group is `udpm@/topic`.
         partners: all that it exchanges data with.
     """
@@ -102,12 +101,6 @@ def connections_of(
 ) -> tuple[NegotiatedConnection, ...]:
     """Return the connections that carry these endpoints, sorted by node and name.
 
-    Args:
-        moved: the endpoints.
-        parties: all that take part.
-        terms: what the system gives.
-        before: what is there already.
-
     Raises:
         PlanError: there are not enough ports or groups.
     """
@@ -160,7 +153,7 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
 
 def _with_ports(drafts: Sequence[_Draft], kept: _Urls, terms: Terms) -> _Urls:
     """Return the URLs of new connections with ports and groups of their own, without peers."""
-    pool = PortPool(terms.first_port, dict(terms.taken))
+    pool = PortPool(terms.first_port, terms.taken)
     hosts = sorted({each.party.host for each in drafts})
     groups: dict[str, ConnectionUrl] = {}
     for draft in drafts:

@@ -2,16 +2,15 @@
 
 The first rule that applies decides; what both ends cannot have is a problem with its reason.
 
-1.  No common wire format or paradigm: a problem.
-2.  Asked for, by a link, else the publisher, else the subscription: that, if both ends can have it.
+1.  Asked for, by a link, else the publisher, else the subscription: that, if both ends can have it.
     Inside a process only `shm` and `multicast` can be asked for, and are handed over directly.
     `multicast` to another host is TCP; `network` is what is there if that is one IP transport, else
     UDP before TCP, IPv6 first where a host has an IPv6 address.
-3.  One process: handed over inside it.
-4.  An end whose transports are not known: its RMW chooses.
-5.  One host: what is there anyway if that is one transport; shared memory; one datagram to a group
+2.  One process: handed over inside it.
+3.  An end whose transports are not known: its RMW chooses.
+4.  One host: what is there anyway if that is one transport; shared memory; one datagram to a group
     (TTL 0, loopback) where several processes listen; UDP, TCP.
-6.  Two hosts: TCP if the publisher sends to a group, which stays on its host, or if the data may
+5.  Two hosts: TCP if the publisher sends to a group, which stays on its host, or if the data may
     not be lost and are more than one datagram; else what is there anyway, UDP, TCP.
 
 An end that asked for something else than what was chosen, where no link decides, is a problem.
@@ -32,11 +31,7 @@ from lifecycle.plan.negotiation.parties import End, NegotiatedFlow, Party
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True):
-    """A publisher and a subscription of one topic.
-
-    Attributes:
-        link: the transport that a link demands.
-    """
+    """A publisher and a subscription of one topic, and what a link demands for them."""
 
     publisher: Party
     writer: PlannedEndpoint
@@ -61,15 +56,6 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     def same_process(self) -> bool:
         """Whether both are in one process."""
         return self.same_host and self.publisher.process == self.subscription.process
-
-    @property
-    def present(self) -> list[Medium]:
-        """By what the data go if neither end leaves its participant, see `carried`."""
-        return carried(
-            self.publisher.transports_at(self.writer),
-            self.subscription.transports_at(self.reader),
-            same_host=self.same_host,
-        )
 
     @property
     def common(self) -> set[str]:
@@ -133,16 +119,13 @@ def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool
     """Return by what Fast DDS 2.14 sends from a participant with some transports to another.
 
     Shared memory wins on one host. Of IP transports all that are common carry every sample, so
-    more than one means that it arrives twice.
+    more than one means that it arrives twice; none, that they never meet.
 
     Args:
         writer: transports of one participant, values of Medium; a group is
             `udpm@239.255.1.9:7901`.
         reader: of the other one.
         same_host: whether they share memory and loopback.
-
-    Returns:
-        Media, sorted; empty if they never meet.
     """
     common = _unicast(writer, same_host=same_host) & _unicast(reader, same_host=same_host)
     found = {each for each in common if each.is_network}
@@ -160,10 +143,6 @@ def discover(one: Collection[str], other: Collection[str]) -> bool:
 
     Fast DDS 2.14 announces participants by shared memory only where they have nothing else
     (`fastdds.shm.enforce_metatraffic`, by default `none`).
-
-    Args:
-        one: transports of a participant, as of `carried`.
-        other: of the other one.
     """
     networks = [
         {each for each in _unicast(transports, same_host=True) if each.is_network}
@@ -189,14 +168,11 @@ def choose(
     """Return what carries a pair.
 
     Args:
-        pair: the pair.
+        pair: a publisher and a subscription.
         by_multicast: another subscription of this publisher gets its data from a group.
         listeners: processes of the publisher's host, but its own, that subscribe to the topic.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
     """
-    unable = _common_ground(pair)
-    if unable:
-        return pair.problem("", unable)
     wish, who = pair.wish
     if pair.same_process:
         if wish in (FlowTransport.ANY, FlowTransport.SHM, FlowTransport.MULTICAST):
@@ -226,21 +202,6 @@ def choose(
     return choice
 
 
-def _common_ground(pair: Pair) -> str:
-    """Return why the two cannot communicate whatever carries it; empty if they can."""
-    one, other = pair.publisher, pair.subscription
-    for word, mine, theirs, needed in (
-        ("wire format", one.serializations, other.serializations, {*one.serializations}),
-        ("communication paradigm", one.paradigms, other.paradigms, {"publish-subscribe"}),
-    ):
-        if not {*mine} & {*theirs} & needed:
-            return (
-                f"no {word} is common; {one.key!r} has {_list(mine)}; {other.key!r} has"
-                f" {_list(theirs)}"
-            )
-    return ""
-
-
 def _list(words: Iterable[str]) -> str:
     return ", ".join(words) or "none"
 
@@ -265,9 +226,8 @@ def _able(party: Party) -> tuple[str, ...]:
 
 def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> NegotiatedFlow:
     if wish is FlowTransport.NETWORK:
-        present = pair.present
-        there = present[0] if len(present) == 1 and present[0] in wish.media else ""
-        medium = there or _first_ip(pair)
+        default = _default(pair)
+        medium = default if default in wish.media else _first_ip(pair)
         return pair.by(medium, who) if medium else _none_common(pair, " by the network")
     if wish is FlowTransport.MULTICAST and not pair.same_host:
         wish, who = FlowTransport.TCPV4, "multicast stays on its host"
@@ -294,7 +254,11 @@ def _first_ip(pair: Pair) -> str:
 
 def _default(pair: Pair) -> str:
     """Return what carries the pair anyway; empty if that is nothing, or arrives twice."""
-    present = pair.present
+    present = carried(
+        pair.publisher.transports_at(pair.writer),
+        pair.subscription.transports_at(pair.reader),
+        same_host=pair.same_host,
+    )
     return present[0] if len(present) == 1 else ""
 
 

@@ -37,9 +37,8 @@ def negotiate(
 ) -> DataLayerGraph:
     """Choose how data get from every publisher to every subscription of its topic.
 
-    In this order: what a link demands, what the publisher asks for, what the subscription asks for,
-    the same process, the same host, another host (see `media.py`). What cannot be made
-    is a problem; everything else is negotiated all the same.
+    The rules are in `media.py`. What cannot be made is a problem; everything else is negotiated all
+    the same.
 
     Args:
         parties: nodes with their endpoints, in any order.
@@ -120,10 +119,6 @@ class _Carriers:
 
     An endpoint moves only when a pair of its gets another medium than was chosen: the publisher
     first, then the subscription. What moves takes all its media along.
-
-    Args:
-        chosen: pairs with the medium of each.
-        terms: what the system gives.
     """
 
     def __init__(self, chosen: Sequence[tuple[Pair, NegotiatedFlow]], terms: Terms) -> None:

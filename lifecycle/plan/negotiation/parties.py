@@ -8,7 +8,7 @@ Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 import msgspec
@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
     FlowTransport,
     RunKind,
 )
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import (
     BUILTIN_TRANSPORTS,
     CONNECTABLE,
@@ -42,12 +42,6 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedParticipant,
 )
-
-PARADIGMS = ("publish-subscribe", "request-response")
-"""Topics; services, and actions, which consist of both."""
-
-SERIALIZATIONS = ("cdr",)
-"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
 
 End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""
@@ -76,8 +70,6 @@ class Party(msgspec.Struct, frozen=True, kw_only=True):
     transports: tuple[str, ...] = CONNECTABLE
     own: tuple[str, ...] = RMW_DEFAULT
     connectable: bool = True
-    serializations: tuple[str, ...] = SERIALIZATIONS
-    paradigms: tuple[str, ...] = PARADIGMS
     endpoints: tuple[PlannedEndpoint, ...] = ()
     participants: tuple[PlannedParticipant, ...] = ()
     contacts: tuple[Contact, ...] = ()
@@ -120,7 +112,7 @@ class Terms(msgspec.Struct, frozen=True, kw_only=True):
     server: Peer | None = None
     server_medium: Medium = DEFAULT_TCP
     first_port: int = 7910
-    taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    taken: Mapping[str, Collection[int]] = msgspec.field(default_factory=dict)
     multicast_group: str = "239.255.1.1"
     max_datagram_bytes: int | None = None
     observers: tuple[Contact, ...] = ()
@@ -176,13 +168,12 @@ class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
     """Return the transports of a participant with these URLs; a group as `udpm@ADDRESS:PORT`."""
-    return tuple(dict.fromkeys(_transport(parse(text)) for text in urls))
-
-
-def _transport(url: ConnectionUrl) -> str:
-    if url.transport.is_group:
-        return f"{url.transport}@{url.address}:{url.port}"
-    return url.transport
+    return tuple(
+        dict.fromkeys(
+            f"{url.transport}@{url.address}:{url.port}" if url.transport.is_group else url.transport
+            for url in map(parse, urls)
+        )
+    )
 
 
 def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], FlowTransport]:
@@ -203,7 +194,7 @@ def party_of_node(
     """Return a node as a party, from what its manifest declares alone.
 
     Args:
-        node: its participants that are declared or make flows unique in place, no negotiated ones.
+        node: without negotiated participants.
         hosts: of the system.
         rmw: the RMW identifier that it runs with.
         variables: what a COMMAND node's process gets beside its own.
@@ -240,14 +231,12 @@ def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnecti
     An extra participant that made a publisher's flow unique and carries none any more is removed;
     the publisher's connection takes its purpose.
     """
-    places: dict[str, NegotiatedConnection] = {
-        label: each for each in connections for label in each.map
-    }
+    places = {label: each for each in connections for label in each.map}
     endpoints = []
-    carriers: dict[str, PlannedParticipant] = {each.name: each for each in node.participants}
+    carriers = {each.name: each for each in node.participants}
     takes: dict[str, list[PlannedParticipant]] = {}
     for each in node.endpoints:
-        connection = places.get(f"{each.kind.value}/{each.name}")
+        connection = places.get(each.kind.spell(each.name))
         if connection is None:
             endpoints.append(each)
             continue
@@ -265,12 +254,11 @@ def _participant(
     node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
 ) -> PlannedParticipant:
     sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
-    reasons = ", ".join(dict.fromkeys(each.reason for each in replaced))
+    reason = f"connection {connection.name}, {connection.reason}"
     return PlannedParticipant(
         name=participant_name(node_name, connection.name),
         dscp=next((each.dscp for each in replaced), None),
-        reason=f"connection {connection.name}, {connection.reason}"
-        f"{f'; {reasons}' if reasons else ''}",
+        reason="; ".join([reason, *dict.fromkeys(each.reason for each in replaced)]),
         max_datagram_bytes=min(sizes, default=None),
         non_blocking_send=any(each.non_blocking_send for each in replaced),
         connection=connection.name,
@@ -305,7 +293,7 @@ def terms_of(plan: Plan) -> Terms:
         server=None if server is None else Peer(address=server.address, port=server.port),
         server_medium=DEFAULT_TCP if server is None or server.tcp else RMW_DISCOVERY,
         first_port=plan.discovery.first_port,
-        taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
+        taken=taken,
         multicast_group=plan.data_layer.multicast_group,
         max_datagram_bytes=plan.network.max_datagram_bytes,
         observers=tuple(

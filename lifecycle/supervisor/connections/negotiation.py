@@ -96,8 +96,6 @@ def party_of(
         transports=(configuration.transports or CONNECTABLE) if known else (),
         own=(transports_of(own_urls) or default) if known else (),
         connectable=known,
-        serializations=configuration.serializations,
-        paradigms=configuration.paradigms,
         endpoints=tuple(
             _endpoint(each, planned, {one.connection: one.name for one in there})
             for each in configuration.endpoints
@@ -232,19 +230,16 @@ class NegotiatedSource:
             names: of the nodes that are started again, of new ones and of those that are gone.
         """
         keys = {self._planned[name].key for name in names if name in self._planned}
-        taken = {host: set(ports) for host, ports in self._terms.taken}
+        taken = {host: set(ports) for host, ports in self._terms.taken.items()}
         hosts = {each.key: self._hosts.host(each.machine) for each in self._plan.nodes}
         for each in self.graph.connections:
             if each.node in keys:
                 urls = (parse(text) for text in each.urls)
                 tcp = (url for url in urls if url.transport.is_tcp)
                 taken.setdefault(hosts[each.node], set()).update(ports_of(tcp))
-        for host, ports in terms_of(plan).taken:
+        for host, ports in terms_of(plan).taken.items():
             taken.setdefault(host, set()).update(ports)
-        self._terms = replace(
-            self._terms,
-            taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
-        )
+        self._terms = replace(self._terms, taken=taken)
         self.graph = replace(
             self.graph,
             connections=tuple(each for each in self.graph.connections if each.node not in keys),

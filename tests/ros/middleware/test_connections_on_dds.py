@@ -32,7 +32,6 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.sockets import OpenSocket, open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedServer,
@@ -245,13 +244,7 @@ def test_an_idle_connection_costs_no_thread_of_ours_and_no_time(
 def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_them(
     fresh_domain: int, spun: Node, wait_until: WaitUntil, ports: list[int], tcp: bool
 ) -> None:
-    server = PlannedServer(
-        machine="",
-        address="127.0.0.1",
-        port=ports[7],
-        tcp=tcp,
-        prefix=parse(f"udpv4://127.0.0.1:7911?server=127.0.0.1:{ports[7]}").server_prefix,
-    )
+    server = PlannedServer(machine="", address="127.0.0.1", port=ports[7], tcp=tcp)
     argv, environment = discovery_server_command(server)
     assert not discovery_server_listens(server)
     process = subprocess.Popen(argv, env=environment, stdout=subprocess.DEVNULL)

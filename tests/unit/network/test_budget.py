@@ -68,12 +68,6 @@ def test_exactly_as_many_fit_as_the_arithmetic_says(domain_id: int, platform: st
     assert len(overflows(domain_id, participants=count + 1, ephemeral=ephemeral)) == 1
 
 
-def test_negative_numbers_are_refused() -> None:
-    with pytest.raises(ValueError) as caught:
-        overflows(0, participants=-1)
-    assert str(caught.value) == "cannot count -1 participants or subscriptions; use 0 or more"
-
-
 def test_every_unique_port_may_go_to_the_subscription_of_one_that_does_not_say_how_many() -> None:
     assert overflows(0, participants=120) == ()
     (message,) = overflows(0, participants=401, ephemeral=EVERYWHERE)

@@ -16,6 +16,7 @@ from lifecycle.manifest.model import (
     Node,
     ParameterDeclaration,
     Policy,
+    Quantity,
     Reaction,
     Restart,
     Run,
@@ -51,6 +52,7 @@ def _talker(**changes: Any) -> tuple[Node, ...]:
 
 
 BEFORE = (TALKER, LISTENER)
+DELAY = Quantity(name="max_delay_ms", value=5.0, at=at(1))
 
 
 def test_nodes_of_one_manifest_alone_come_and_go_and_all_else_stays() -> None:
@@ -101,7 +103,7 @@ def test_what_reaches_a_process_restarts_it_alone(changes: dict[str, Any]) -> No
         {"on_violation": (Reaction(rule="flow", what=Consequence.STOP),)},
         {"may_end": True},
         {"state": TargetState.INACTIVE},
-        {"flows": (need(EndpointKind.PUBLISHER, "chatter", max_delay_ms=5.0),)},
+        {"flows": (need(EndpointKind.PUBLISHER, "chatter", quantities=(DELAY,)),)},
     ],
     ids="-".join,
 )
@@ -113,7 +115,11 @@ def test_what_is_only_judged_by_touches_no_node(changes: dict[str, Any]) -> None
 
 
 def test_another_treatment_of_a_flow_by_the_network_touches_no_node() -> None:
-    qi = [(need(EndpointKind.PUBLISHER, "chatter", five_qi=each),) for each in (85, 82)]
+    asked = [Quantity(name="five_qi", value=each, at=at(1)) for each in (85, 82)]
+    qi = [
+        (need(EndpointKind.PUBLISHER, "chatter", five_qi=int(each.value), quantities=(each,)),)
+        for each in asked
+    ]
     change = _change(_talker(flows=qi[0]), _talker(flows=qi[1]))
     assert not change.ends_or_starts
     assert change.differences

@@ -23,7 +23,6 @@ from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.model import PlanError
-from lifecycle.plan.render import render_text
 from tests.builders import (
     at,
     endpoint,
@@ -191,13 +190,6 @@ def test_a_flow_of_its_own_is_a_connection_where_endpoints_are_static():
         ),
     )
     assert [each.medium for each in plan.flows] == ["udpv4"]
-
-
-def test_who_has_shared_memory_alone_needs_no_port():
-    plan = planned(
-        node("talker", publisher("t")), node("listener", subscription("t")), discovery=IN_MEMORY
-    )
-    assert render_text(plan).count("none: shared memory alone") == 3
 
 
 def test_a_command_with_shared_memory_alone_looks_further_than_loopback():

@@ -234,7 +234,7 @@ MADE = {
     "where ports are fixed connections have all of theirs": (
         [party("p", pub(), own=("shm",)), party("s", sub(), own=("shm",))],
         {TO_S: Wish.UDPV4},
-        Terms(fixed=True, taken=((HERE, (7911,)),)),
+        Terms(fixed=True, taken={HERE: (7911,)}),
         {"s": ("udpv4", "a link says so")},
         {
             "p udpv4": (
@@ -293,19 +293,6 @@ REFUSED = {
             "cannot carry '/t' from 'p' to 's': 'p' can be connected by udpv4, shm; 's' by tcpv4; "
             "shared memory does not leave a host, and an IP transport needs addresses of its "
             "version: 10.77.0.1 and 10.77.0.2"
-        ),
-    ),
-    "no wire format": (
-        [party("p", pub()), party("s", sub(), serializations=("xcdr2",))],
-        {TO_S: Wish.UDPV4},
-        "cannot carry '/t' from 'p' to 's': no wire format is common; 'p' has cdr; 's' has xcdr2",
-    ),
-    "no paradigm": (
-        [party("p", pub()), party("s", sub(), paradigms=("request-response",))],
-        {},
-        (
-            "cannot carry '/t' from 'p' to 's': no communication paradigm is common; 'p' has "
-            "publish-subscribe, request-response; 's' has request-response"
         ),
     ),
     "inside a process nothing can be chosen": (

@@ -17,14 +17,13 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
-    Machine,
     Run,
     RunKind,
 )
 from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.render import render_text, spell_qos
-from tests.builders import at, need, node, planned, publisher, subscription, teleop
+from tests.builders import need, node, planned, publisher, subscription, teleop
 
 TELEOP = """\
 system robot: 2 nodes, 2 processes, 3 flows; domain 7, discovery range system_default
@@ -70,17 +69,6 @@ flows
   /robot/video    /robot/camera → /viewer  udpv4 (other host); strongly unique, at most 5 ms
   /robot/battery  /robot/camera → /viewer  udpv4 (other host)
   /robot/status   /robot/camera → /viewer  udpv4 (other host)
-
-ports, if participants start in this order and none is taken
-  machine robot
-    0  supervisor             discovery 9160, user 9161
-    1  camera                 discovery 9162, user 9163
-    2  /robot/_camera_flow_0  discovery 9164, user 9165
-    3  /robot/_camera_flow_1  discovery 9166, user 9167
-  machine operator
-    0  supervisor  discovery 9160, user 9161
-    1  viewer      discovery 9162, user 9163
-    1 unique subscription: the first free of 7000–7399
 """
 
 
@@ -159,21 +147,6 @@ def test_an_empty_system_is_one_line():
 )
 def test_a_profile_is_spelled_in_one_line(qos: QosProfile, words: list[str]):
     assert spell_qos(qos) == ", ".join(words)
-
-
-def test_machines_without_an_address_are_this_host_and_share_its_ports():
-    machines = tuple(Machine(name=name, at=at(2)) for name in ("robot", "operator"))
-    nodes = (node("a", machine="robot"), node("b", machine="operator"))
-    text = render_text(planned(*nodes, machines=machines))
-    assert "  machine robot, operator\n    0  supervisor  " in text
-    assert "\n    2  b  " in text
-
-
-def test_a_participant_beyond_the_last_port_is_shown_without_one():
-    nodes = [node(f"n{index}") for index in range(64)]
-    plan = planned(*nodes, discovery=Discovery(domain_id=232))
-    text = render_text(plan)
-    assert "    63  n62         no port left in this domain" in text.splitlines()
 
 
 # --- the verb

@@ -10,18 +10,14 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Severity
 from lifecycle.manifest.model import (
-    Authority,
-    ConnectionDeclaration,
-    DataLayer,
     EndpointKind,
     Health,
     Position,
     Run,
     RunKind,
 )
-from lifecycle.network.connection_url import parse
 from lifecycle.plan.programs import Resolution, resolve_programs
-from tests.builders import at, endpoint, manifest, node, publisher, subscription
+from tests.builders import endpoint, manifest, node, publisher, subscription
 
 TALKER = """
 from lifecycle import LifecycleNode, on_message, on_service, on_action, on_goal, on_timer
@@ -384,28 +380,6 @@ def test_how_a_class_of_others_is_called_is_checked(
     run = Run(kind=RunKind.PYTHON, python=f"them:{name}", arguments=tuple(arguments.items()))
     found = resolve_programs(manifest(node("talker", run=run, managed=managed)), environment={})
     assert said(found) == ([message] if message else [])
-
-
-def test_connections_that_a_class_of_rclpy_cannot_be_given_are_refused(folder: Path) -> None:
-    write(folder, them=FOREIGN)
-    url = parse("udpv4://")
-    mapped = ((EndpointKind.PUBLISHER, "a"), (EndpointKind.SERVICE_SERVER, "reset"))
-    net = ConnectionDeclaration(name="net", urls=(url,), map=mapped, at=at(1))
-    run = Run(kind=RunKind.PYTHON, python="them:Managed")
-    made = replace(node("talker", run=run), connections=(net,))
-    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR))
-    assert said(resolve_programs(system, environment={})) == [
-        (
-            "cannot leave the connections of 'talker' to the supervisor: Managed (them.py) is not "
-            "a lifecycle.LifecycleNode, and makes its endpoints itself; derive it from "
-            "lifecycle.LifecycleNode, or use 'data_layer: {authority: nodes}'"
-        ),
-        (
-            "cannot map service server 'reset' of 'talker' to connection 'net': Managed (them.py) "
-            "is not a lifecycle.LifecycleNode, and only its topics can be placed; derive it from "
-            "lifecycle.LifecycleNode, or leave it out of 'map'"
-        ),
-    ]
 
 
 def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -> None:

@@ -22,7 +22,6 @@ from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeForkServer, World
 
 REAL_TIME = True
-PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def nobody() -> int:
 
 
 def served(port: int, machine: str = "") -> Plan:
-    server = PlannedServer(machine=machine, address="127.0.0.1", port=port, prefix=PREFIX)
+    server = PlannedServer(machine=machine, address="127.0.0.1", port=port)
     return replace(plan_of(planned_node("a")), server=server)
 
 

@@ -64,8 +64,6 @@ def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
         transports=("udpv4", "tcpv4"),
         own=RMW_DEFAULT,
         connectable=True,
-        serializations=("cdr",),
-        paradigms=("publish-subscribe",),
         endpoints=(
             PlannedEndpoint(
                 kind=PUB,
