@@ -13,8 +13,6 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-import msgspec
-
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import (
@@ -60,11 +58,10 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.manifest.shared import Shared
-from lifecycle.manifest.written import build, read, read_part
+from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.document import Document, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
@@ -84,26 +81,11 @@ def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Net
     network = root.get("network")
     if network is None:
         return Network()
-    keys = network.plain()
-    mapping = keys.pop("transport_priority_mapping", None)
     return build(
         Network,
-        read(keys, NetworkKeys, strict=False),
-        transport_priority_mapping=None if mapping is None else _priority_mapping(network, found),
+        read_part(network, NetworkKeys),
         five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
     )
-
-
-def _priority_mapping(
-    network: Document, found: list[Diagnostic]
-) -> TransportPriorityMapping | None:
-    place = ("transport_priority_mapping",)
-    try:
-        return read_part(network, TransportPriorityMapping, place)
-    except msgspec.ValidationError as problem:
-        message, _, hint = str(problem.__cause__).partition("; ")
-        found.append(error("manifest.transport-priority", network.at(place), message, hint))
-        return None
 
 
 def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:

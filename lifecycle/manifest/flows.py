@@ -2,8 +2,8 @@
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
-`lifecycle.network`); the ways to a DSCP besides writing it: a TRANSPORT_PRIORITY through its
-mapping, a 5QI through a mapping, and a value of its own where the DSCP is the identifier. Pure.
+`lifecycle.network`); the ways to a DSCP besides writing it: a 5QI through a mapping, and a value of
+its own where the DSCP is the identifier. Pure.
 """
 
 from __future__ import annotations
@@ -25,14 +25,7 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import topic_of
-from lifecycle.network.dscp import (
-    ECN_MASK,
-    MAX_DSCP,
-    TransportPriorityMapping,
-    code_points,
-    describe,
-    map_priority,
-)
+from lifecycle.network.dscp import MAX_DSCP, code_points
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
 from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
@@ -117,10 +110,6 @@ def _proposed(
     return FlowClass(five_qi=proposal.five_qi.value, reason=proposal.why)
 
 
-DIRECT = TransportPriorityMapping(mask=0xFF)
-"""Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
-
-
 class Marking(msgspec.Struct, frozen=True, kw_only=True):
     """A DSCP and its source.
 
@@ -140,18 +129,13 @@ class Marking(msgspec.Struct, frozen=True, kw_only=True):
 def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking:
     """Return the marking of one endpoint.
 
-    The priority of a publisher is of its data, that of a subscription of its acknowledgements, and
-    neither follows from the other (*RTI Connext Micro, Transport Priority*, "Configuring transport
-    priority"). A 5QI is of data and marks publishers only.
+    A 5QI is of data and marks publishers only; what a subscription sends is acknowledgements.
 
     Args:
         need: what it asks for.
         network: the system's mappings.
         five_qi: its 5QI, `auto` resolved.
     """
-    if need.transport_priority is not None and need.dscp is None:
-        mapping = network.transport_priority_mapping or DIRECT
-        return _mapped(need.transport_priority, mapping)
     publishes = need.kind is EndpointKind.PUBLISHER
     if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
         return Marking(dscp=need.dscp)
@@ -159,30 +143,6 @@ def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking
     if dscp is None:
         return Marking(notes=(f"cannot mark 5QI {five_qi} with a DSCP: mapping {name!r} has none",))
     return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
-
-
-def _mapped(number: int, mapping: TransportPriorityMapping) -> Marking:
-    result = map_priority(number, mapping)
-    priority = f"transport_priority {number} ({number:#x})"
-    through = f"mask {mapping.mask:#x}, low {mapping.low:#x}, high {mapping.high:#x}"
-    if result.tos is None:
-        return Marking(notes=(f"cannot mark anything with {priority}: the mask is 0",))
-    if result.sets_ecn:
-        clear = result.tos & ~ECN_MASK
-        message = (
-            f"cannot use {priority}: with {through} it is TOS {result.tos} ({result.tos:#04x}), "
-            f"whose two lowest bits are ECN and belong to the transport (RFC 3168)"
-        )
-        return Marking(problem=(message, f"without them it is {describe(clear >> 2)}"))
-    note = (
-        f"cannot map bits {result.ignored_bits:#x} of {priority}: they are outside mask "
-        f"{mapping.mask:#x}; what is left is {describe(result.tos >> 2)}"
-    )
-    return Marking(
-        dscp=result.tos >> 2,
-        reason=f"{priority} with {through}",
-        notes=(note,) if result.ignored_bits else (),
-    )
 
 
 def identifiers(taken: Iterable[int]) -> tuple[int, ...]:

@@ -1,10 +1,10 @@
-"""Checks of network flow needs: DSCP, priority, 5QI, DSCPs as flow identifiers, and links.
+"""Checks of network flow needs: DSCP, 5QI, DSCPs as flow identifiers, and links.
 
-Owns: check.flow-unknown-endpoint, check.flow-dscp, check.transport-priority, check.flow-five-qi,
-check.five-qi-class, check.flow-impossible, check.flow-foreign; check.dscp-exhausted,
-check.dscp-not-unique, check.dscp-repurposed, the limits that *Unique Network Flows* gives for the
-DSCP as an identifier; check.link-unknown-node, check.link-topic, check.link-not-unique: the ends of
-a link exist, meet on the topic, and ask for what the link demands. Pure.
+Owns: check.flow-unknown-endpoint, check.flow-dscp, check.flow-five-qi, check.five-qi-class,
+check.flow-impossible, check.flow-foreign; check.dscp-exhausted, check.dscp-not-unique,
+check.dscp-repurposed, the limits that *Unique Network Flows* gives for the DSCP as an identifier;
+check.link-unknown-node, check.link-topic, check.link-not-unique: the ends of a link exist, meet on
+the topic, and ask for what the link demands. Pure.
 """
 
 from __future__ import annotations
@@ -70,32 +70,17 @@ def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
 
 def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     need = each.need
-    given = [
-        word
-        for word, value in (("a DSCP", need.dscp), ("a priority", need.transport_priority))
-        if value is not None
-    ]
-    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
+    marks = need.dscp is not None and need.kind is EndpointKind.SUBSCRIPTION
+    if marks and _is_best_effort(node, need):
         message = (
-            f"cannot mark anything that subscription {need.name!r} sends with {given[0]}: it is "
+            f"cannot mark anything that subscription {need.name!r} sends with a DSCP: it is "
             f"BEST_EFFORT and acknowledges nothing"
         )
         hint = "make it RELIABLE, or mark the publishers of the topic"
         yield note("check.flow-dscp", need.at, message, hint)
-    if len(given) > 1:
-        message = (
-            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
-            f"the whole mark"
-        )
-        yield error("check.flow-dscp", need.at, message, f"keep one; {_both(need)}")
-        return
-    message, hint = each.marking.problem
-    if message and need.transport_priority is not None:
-        yield error("check.flow-dscp", need.at, message, hint)
     for advice in each.marking.notes:
-        rule = "check.five-qi-class" if need.transport_priority is None else ""
         message, _, hint = advice.partition("; ")
-        yield note(rule or "check.transport-priority", need.at, message, hint)
+        yield note("check.five-qi-class", need.at, message, hint)
 
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:
@@ -103,11 +88,6 @@ def _is_best_effort(node: Node, need: FlowNeed) -> bool:
     endpoint = node.interface.find(need.kind, need.name)
     qos = None if endpoint is None else endpoint.qos
     return qos is not None and qos.reliability is Reliability.BEST_EFFORT
-
-
-def _both(need: FlowNeed) -> str:
-    dscp, priority = need.dscp or 0, need.transport_priority or 0
-    return f"the one is {describe(dscp)}, the other goes through a mapping from {priority:#x}"
 
 
 def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -194,7 +174,7 @@ def _repurposed(system: DeclaredSystem) -> Iterator[Diagnostic]:
     ]
     for _, need in asking:
         message, hint = need.marking.problem
-        if message and need.need.transport_priority is None:
+        if message:
             yield error("check.dscp-exhausted", need.need.at, message, hint)
     holders: dict[int, Resolved] = {}
     for each, need in asking:

@@ -19,7 +19,7 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.network.dscp import TransportPriorityMapping, code_points
+from lifecycle.network.dscp import code_points
 from lifecycle.network.five_qi import dscp_mapping, five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 from tests.builders import at, link, manifest, need, node, publisher, subscription
@@ -73,10 +73,6 @@ def test_the_smaller_datagram_serves_all_of_a_class():
         need(PUB, "large", dscp=46, max_message_size=60_000),
     )
     assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
-
-
-def test_a_priority_and_a_dscp_that_come_to_the_same_share():
-    assert carried(need(PUB, "a", dscp=46), need(PUB, "b", transport_priority=184)) == [("a", "b")]
 
 
 def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
@@ -187,37 +183,6 @@ def test_network_transport_is_ipv6_where_the_machine_s_address_is():
 # --- marks
 
 
-@pytest.mark.parametrize(
-    ("priority", "mapping", "dscp"),
-    [
-        (184, None, 46),  # without a mapping, the priority is the TOS byte
-        (0xB8, TransportPriorityMapping(mask=0xFF), 46),
-        (0, TransportPriorityMapping(mask=0x03, high=0x03), 0),
-        (3, TransportPriorityMapping(mask=0x03, high=0xFC), 63),
-        (184, TransportPriorityMapping(mask=0), None),
-    ],
-)
-def test_a_transport_priority_becomes_a_dscp(
-    priority: int, mapping: TransportPriorityMapping | None, dscp: int | None
-):
-    network = Network(transport_priority_mapping=mapping)
-    marking = marking_of(need(PUB, "a", transport_priority=priority), network, None)
-    assert (marking.dscp, marking.problem) == (dscp, ("", ""))
-
-
-def test_where_a_dscp_comes_from_is_said():
-    marking = marking_of(need(PUB, "a", transport_priority=184), Network(), None)
-    assert marking.reason == "transport_priority 184 (0xb8) with mask 0xff, low 0x0, high 0xff"
-
-
-def test_mask_0_marks_nothing_and_says_so():
-    network = Network(transport_priority_mapping=TransportPriorityMapping(mask=0))
-    marking = marking_of(need(PUB, "a", transport_priority=184), network, None)
-    assert marking.notes == (
-        "cannot mark anything with transport_priority 184 (0xb8): the mask is 0",
-    )
-
-
 def test_a_5qi_marks_only_where_a_mapping_is_asked_for():
     asked = need(PUB, "a", five_qi=82)
     mapping = dscp_mapping("azure_private_5g_core")
@@ -316,12 +281,11 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     system = load("flows_every_key.lifecycle.yaml").manifest
     network = system.network
     assert network.flow_identification is FlowIdentification.PARTICIPANT
-    assert network.transport_priority_mapping == TransportPriorityMapping(mask=0xFF)
     assert network.five_qi_dscp is not None
     assert network.five_qi_dscp.values == ((82, 34), (85, 46))
     assert network.max_datagram_bytes == 1300
     video, pose, alarm, log = system.nodes[0].flows
-    assert (video.unique, video.transport_priority, video.enforce) == (STRICTLY, 184, False)
+    assert (video.unique, video.dscp, video.enforce) == (STRICTLY, 46, False)
     assert (video.max_message_size, video.transport, video.non_blocking_send) == (
         60000,
         NETWORK,
@@ -329,7 +293,7 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     )
     assert (pose.five_qi, pose.five_qi_auto) == (None, True)
     assert (pose.max_delay_ms, pose.loss, pose.rate_hz) == (10.0, 1e-4, 50.0)
-    assert (alarm.five_qi, alarm.five_qi_auto, alarm.transport_priority) == (82, False, None)
+    assert (alarm.five_qi, alarm.five_qi_auto, alarm.dscp) == (82, False, None)
     assert (log.dscp, log.transport, log.non_blocking_send) == (8, FlowTransport.ANY, False)
     assert system.nodes[1].flows[0].transport is NETWORK
 

@@ -156,13 +156,6 @@ def test_a_best_effort_subscription_is_told_that_it_sends_nothing_to_mark() -> N
     )
 
 
-def test_a_subscription_has_one_mark_too() -> None:
-    (found,) = check(acknowledging(Reliability.RELIABLE, transport_priority=0x20))
-    assert found.message == (
-        "cannot give subscription 's0' both dscp and transport_priority: each is the whole mark"
-    )
-
-
 def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -> None:
     network = Network(flow_identification=FlowIdentification.DSCP)
     made = acknowledging(Reliability.RELIABLE, dscp=MARKED.dscp)
