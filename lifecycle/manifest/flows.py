@@ -2,13 +2,12 @@
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
-`lifecycle.network`); the ways to a DSCP besides writing it: a 5QI through a mapping, and a value of
-its own where the DSCP is the identifier. Pure.
+`lifecycle.network`); the way to a DSCP besides writing it: a 5QI through a mapping. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import msgspec
 from msgspec.structs import replace
@@ -16,7 +15,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
-    FlowIdentification,
     FlowNeed,
     FlowTransport,
     Manifest,
@@ -25,7 +23,6 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import topic_of
-from lifecycle.network.dscp import MAX_DSCP, code_points
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
 from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
@@ -116,13 +113,11 @@ class Marking(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         dscp: 0–63; None if nothing is marked.
         reason: one phrase for people; empty where the DSCP is written as such.
-        problem: message and hint of why the need cannot be met; two empty texts if it can.
         notes: what a user should know, one sentence each, each starting with "cannot".
     """
 
     dscp: int | None = None
     reason: str = ""
-    problem: tuple[str, str] = ("", "")
     notes: tuple[str, ...] = ()
 
 
@@ -143,25 +138,6 @@ def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking
     if dscp is None:
         return Marking(notes=(f"cannot mark 5QI {five_qi} with a DSCP: mapping {name!r} has none",))
     return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
-
-
-def identifiers(taken: Iterable[int]) -> tuple[int, ...]:
-    """Return the DSCP values that may become identifiers, those that mislead least first.
-
-    First pool 2, `xxxx11`, which RFC 2474 leaves to experimental and local use, then values without
-    a name, then named classes, and 0, which every unmarked packet carries, last.
-
-    Args:
-        taken: values that publishers have already.
-    """
-    named = {each.dscp for each in code_points()}
-    used = set(taken)
-    return tuple(
-        sorted(
-            (each for each in range(MAX_DSCP + 1) if each not in used),
-            key=lambda each: (each == 0, each in named, each & 0b11 != 0b11, each),
-        )
-    )
 
 
 class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
@@ -246,8 +222,6 @@ class FlowNeeds:
             for node in manifest.nodes
             for need in node.flows
         }
-        if manifest.network.flow_identification is FlowIdentification.DSCP:
-            resolved = _with_identifiers(resolved, manifest)
         self._resolved = {key: self._with_datagrams(key[0], each) for key, each in resolved.items()}
 
     def of(self, node_key: str, kind: EndpointKind, name: str) -> ResolvedNeed | None:
@@ -391,40 +365,3 @@ def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
             own = need is not None and need.unique.asks and node.run.kind is RunKind.PYTHON
             answers[topic] = answers.get(topic, True) and own
     return frozenset(topic for topic, every in answers.items() if every)
-
-
-_Key = tuple[str, EndpointKind, str]
-
-
-def _with_identifiers(
-    resolved: dict[_Key, ResolvedNeed], manifest: Manifest
-) -> dict[_Key, ResolvedNeed]:
-    """Give each publisher that needs a unique flow a DSCP of its own (*Unique Network Flows*).
-
-    A DSCP that is written stays. The others get unused values, over all nodes, in the order of the
-    manifest; when the 64 are used up, the rest have a problem instead.
-    """
-    asking = [
-        key
-        for key, each in resolved.items()
-        if each.unique and each.need.kind is EndpointKind.PUBLISHER
-    ]
-    free = iter(identifiers(each.dscp for each in resolved.values() if each.dscp is not None))
-    nodes = {node.key: node for node in manifest.nodes}
-    found = dict(resolved)
-    for number, key in enumerate(asking, start=1):
-        each = resolved[key]
-        if each.dscp is not None or nodes[key[0]].run.kind is not RunKind.PYTHON:
-            continue
-        dscp = next(free, None)
-        if dscp is None:
-            message = (
-                f"cannot give publisher {key[2]!r} of {key[0]!r} a DSCP of its own: it is number "
-                f"{number} of {len(asking)} publishers that need one, and a DSCP has 64 values"
-            )
-            hint = "use 'flow_identification: participant', or ask for fewer unique publishers"
-            marking = Marking(problem=(message, hint))
-        else:
-            marking = Marking(dscp=dscp, reason="its identifier")
-        found[key] = replace(each, marking=marking)
-    return found

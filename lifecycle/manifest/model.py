@@ -209,13 +209,6 @@ class UniqueHow(enum.Enum):
     STRONGLY = "strongly"
 
 
-class FlowIdentification(enum.Enum):
-    """How publishers that need a unique flow get one (*Unique Network Flows*)."""
-
-    PARTICIPANT = "participant"  # sockets of their own: unique transport ports
-    DSCP = "dscp"  # a DSCP of their own as the sixth element of the tuple; at most 64
-
-
 def spelled(pattern: str, message: str) -> Meta:
     """Return the pattern of a string, with what is said of one that does not match."""
     return Meta(pattern=pattern, extra_json_schema={"patternErrorMessage": message})
@@ -910,16 +903,12 @@ class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """How flow needs become network resources.
 
     Attributes:
-        flow_identification: How publishers that need a unique flow get one: sockets of their own
-            (participant), or a DSCP of their own as a sixth element of the tuple (dscp; at most 64,
-            and no router may read them as classes).
         five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
             of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
         max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
             with IPv4 if left out.
     """
 
-    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
     five_qi_dscp: (
         Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
     ) = None

@@ -527,9 +527,6 @@ def _planned_endpoint(
     )
     if need is None:
         return planned
-    message, hint = need.marking.problem
-    if message:
-        raise PlanError(message, hint=hint, at=need.need.at)
     return replace(
         planned,
         unique=need.need.unique,

@@ -6,20 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, identifiers, marking_of
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, marking_of
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     EndpointKind,
-    FlowIdentification,
     FlowNeed,
     FlowTransport,
     Machine,
-    Manifest,
     Network,
     Run,
     RunKind,
 )
-from lifecycle.network.dscp import code_points
 from lifecycle.network.five_qi import dscp_mapping, five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 from tests.builders import at, link, manifest, need, node, publisher, subscription
@@ -197,50 +194,6 @@ def test_a_dscp_that_is_written_wins_over_the_mapping_of_the_5qi():
     assert marking_of(need(PUB, "a", five_qi=82, dscp=46), network, 82).dscp == 46
 
 
-# --- DSCP values as identifiers
-
-
-def test_identifiers_that_mislead_least_come_first_and_default_forwarding_last():
-    order = identifiers([3, 46])
-    named = {each.dscp for each in code_points()}
-    assert len(order) == 62
-    assert order[:3] == (7, 11, 15)  # pool 2 of RFC 2474, for local use
-    assert not named & set(order[: 64 - len(named | {3})])
-    assert order[-1] == 0
-
-
-def of_dscp(count: int, *needs: FlowNeed) -> tuple[FlowNeeds, Manifest]:
-    nodes = [
-        node(f"n{index}", publisher("a"), needs=[need(PUB, "a", STRICTLY)])
-        for index in range(count)
-    ]
-    nodes.append(node("other", *(publisher(each.name) for each in needs), needs=needs))
-    system = manifest(*nodes, network=Network(flow_identification=FlowIdentification.DSCP))
-    return FlowNeeds(system), system
-
-
-def test_each_publisher_that_needs_it_gets_a_dscp_that_no_other_has():
-    needs, system = of_dscp(
-        20, need(PUB, "own", STRICTLY, dscp=3), need(PUB, "class", dscp=46), need(PUB, "none")
-    )
-    values = [needs.of(each.key, PUB, "a").dscp for each in system.nodes[:-1]]
-    assert None not in values
-    assert len({*values, 3, 46}) == 22
-    assert needs.of("other", PUB, "own").dscp == 3
-    assert needs.of("other", PUB, "none").dscp is None
-
-
-def test_a_publisher_that_others_start_cannot_be_marked_and_so_gets_no_identifier():
-    foreign = node(
-        "n",
-        publisher("a"),
-        needs=[need(PUB, "a", OPTIONALLY)],
-        run=Run(kind=RunKind.COMMAND, command=("x",)),
-    )
-    system = manifest(foreign, network=Network(flow_identification=FlowIdentification.DSCP))
-    assert FlowNeeds(system).of("n", PUB, "a").dscp is None
-
-
 # --- 5QI
 
 
@@ -280,7 +233,6 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(CORPUS)
     system = load("flows_every_key.lifecycle.yaml").manifest
     network = system.network
-    assert network.flow_identification is FlowIdentification.PARTICIPANT
     assert network.five_qi_dscp is not None
     assert network.five_qi_dscp.values == ((82, 34), (85, 46))
     assert network.max_datagram_bytes == 1300
@@ -302,7 +254,7 @@ def test_an_included_manifest_does_not_bring_its_network(findings):
     part = """\
     manifest_version: 1
     system: part
-    network: {flow_identification: dscp}
+    network: {max_datagram_bytes: 1300}
     nodes: {n: {run: {python: "demo:N"}}}
     """
     found = findings("include: [{manifest: part.yaml}]\n", part_yaml=part)
