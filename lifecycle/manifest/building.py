@@ -1,8 +1,8 @@
-"""Validated `nodes:`, `network:`, `data_layer:`, `modes:` and `connections:` → frozen types.
+"""Validated `nodes:`, `data_layer:`, `modes:` and `connections:` → frozen types.
 
 Owns: how a node's keys become fields, its parameters flat and its paths absolute; reading
 connection URLs out of a document; and the findings about all of them that a schema cannot detect.
-Pure but for reading interfaces and mappings by reference.
+Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ from lifecycle.manifest.model import (
     MeasuredKeys,
     Mode,
     ModeParameter,
-    Network,
-    NetworkKeys,
     Node,
     OnViolation,
     ParameterValue,
@@ -62,51 +60,8 @@ from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.document import Document, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
-
-
-_MAX_MAPPING_BYTES = 1_000_000
-
-
-def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Network:
-    """Build the network of a document; the defaults where it declares nothing.
-
-    Args:
-        root: the document.
-        base: folder that the path of a mapping starts from.
-        found: findings are appended here.
-    """
-    network = root.get("network")
-    if network is None:
-        return Network()
-    return build(
-        Network,
-        read_part(network, NetworkKeys),
-        five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
-    )
-
-
-def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
-    """Read a mapping: a published one by its name, else a file."""
-    name = network.text("five_qi_dscp")
-    shipped = {each.name: each for each in dscp_mappings()}
-    if name in shipped:
-        return shipped[name]
-    try:
-        with (base / name).open("rb") as file:
-            text = file.read(_MAX_MAPPING_BYTES)
-        return parse_mapping(text)
-    except OSError as problem:
-        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {problem.strerror}"
-        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
-    except ValueError as problem:
-        why = problem.__cause__ or problem
-        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {why}"
-        hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
-    found.append(error("manifest.five-qi-dscp", network.at(("five_qi_dscp",)), message, hint))
-    return None
 
 
 def build_data_layer(root: Document, found: list[Diagnostic]) -> DataLayer:

@@ -1,8 +1,8 @@
-"""Effective flow needs of endpoints: DSCP, 5QI, datagrams and transport after mappings and links.
+"""Effective flow needs of endpoints: 5QI, datagrams and transport after links.
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
-`lifecycle.network`); the way to a DSCP besides writing it: a 5QI through a mapping. Pure.
+`lifecycle.network`). Pure.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
     FlowNeed,
     FlowTransport,
     Manifest,
-    Network,
     Node,
     RunKind,
 )
@@ -107,39 +106,6 @@ def _proposed(
     return FlowClass(five_qi=proposal.five_qi.value, reason=proposal.why)
 
 
-class Marking(msgspec.Struct, frozen=True, kw_only=True):
-    """A DSCP and its source.
-
-    Attributes:
-        dscp: 0–63; None if nothing is marked.
-        reason: one phrase for people; empty where the DSCP is written as such.
-        notes: what a user should know, one sentence each, each starting with "cannot".
-    """
-
-    dscp: int | None = None
-    reason: str = ""
-    notes: tuple[str, ...] = ()
-
-
-def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking:
-    """Return the marking of one endpoint.
-
-    A 5QI is of data and marks publishers only; what a subscription sends is acknowledgements.
-
-    Args:
-        need: what it asks for.
-        network: the system's mappings.
-        five_qi: its 5QI, `auto` resolved.
-    """
-    publishes = need.kind is EndpointKind.PUBLISHER
-    if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
-        return Marking(dscp=need.dscp)
-    name, dscp = network.five_qi_dscp.name, network.five_qi_dscp.dscp_for(five_qi)
-    if dscp is None:
-        return Marking(notes=(f"cannot mark 5QI {five_qi} with a DSCP: mapping {name!r} has none",))
-    return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
-
-
 class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint's need, resolved.
 
@@ -147,7 +113,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         need: as declared.
         topic: fully qualified name; empty if it cannot be resolved.
         unique: it must get an NFE of its own.
-        marking: DSCP, of a publisher's data or of a subscription's acknowledgements.
         flow_class: 5QI; publishers only.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
@@ -160,7 +125,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     need: FlowNeed
     topic: str
     unique: bool
-    marking: Marking
     flow_class: FlowClass
     max_delay_ms: float | None = None
     max_datagram_bytes: int | None = None
@@ -169,8 +133,8 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def dscp(self) -> int | None:
-        """The DSCP that its packets are to carry, 0–63."""
-        return self.marking.dscp
+        """The DSCP of its data, of a subscription of what it acknowledges with, 0–63."""
+        return self.need.dscp
 
     @property
     def five_qi(self) -> int | None:
@@ -293,7 +257,6 @@ class FlowNeeds:
             need=need,
             topic=topic,
             unique=need.unique.asks,
-            marking=marking_of(need, self._manifest.network, flow_class.five_qi),
             flow_class=flow_class,
             max_delay_ms=delay,
             transports=self._transports(node) if self._by_participant(need) else (),

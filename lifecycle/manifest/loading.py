@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.building import (
     build_data_layer,
     build_modes,
-    build_network,
     build_node,
     build_on_violation,
     positions_of,
@@ -42,6 +41,7 @@ from lifecycle.manifest.model import (
     LinkKeys,
     Machine,
     Manifest,
+    Network,
     Node,
     Policy,
 )
@@ -299,14 +299,13 @@ class _Loading:
         self, document: Document, origin: include.Origin, arguments: tuple[tuple[str, str], ...]
     ) -> None:
         """Build what is declared of the whole system: the outermost manifest's holds."""
-        base = origin.path.parent
         declared = Manifest(
             path=origin.shown,
             arguments=arguments,
             system=document.text("system"),
             description=document.text("description"),
             discovery=read_part(document, Discovery, ("discovery",)),
-            network=build_network(document, base=base, found=self.found),
+            network=read_part(document, Network, ("network",)),
             data_layer=build_data_layer(document, self.found),
             policy=read_part(document, Policy, ("policy",)),
             on_violation=build_on_violation(document),

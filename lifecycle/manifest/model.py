@@ -18,7 +18,6 @@ from lifecycle.codec import says
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.five_qi import DscpMapping
 from lifecycle.network.medium import FlowTransport as FlowTransport  # noqa: PLC0414
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -899,26 +898,15 @@ class DataLayer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     multicast_group: Text = "239.255.1.1"
 
 
-class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How flow needs become network resources.
 
     Attributes:
-        five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
-            of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
         max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
             with IPv4 if left out.
     """
 
-    five_qi_dscp: (
-        Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
-    ) = None
     max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
-
-
-class Network(NetworkKeys, frozen=True, kw_only=True):
-    """How flow needs become network resources, with the mapping that is named."""
-
-    five_qi_dscp: DscpMapping | None = None  # type: ignore[assignment]
 
 
 TOLERATED_NODES = (

@@ -21,7 +21,7 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Executor,
     LinkKeys,
-    NetworkKeys,
+    Network,
     NodeKey,
     Policy,
     ProcessKeys,
@@ -752,7 +752,7 @@ class Manifest(Shared, frozen=True, kw_only=True):
     arguments: dict[Name, Argument] = field(default_factory=dict)
     machines: dict[Name, Machine] = field(default_factory=dict)
     discovery: Discovery = Discovery()
-    network: NetworkKeys = NetworkKeys()
+    network: Network = Network()
     data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
     on_violation: OnViolation | None = None

@@ -538,7 +538,6 @@ def _planned_endpoint(
         measure=need.need.measure,
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
-        dscp_reason=need.marking.reason,
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
         max_delay_ms=need.max_delay_ms,

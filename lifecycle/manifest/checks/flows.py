@@ -75,9 +75,6 @@ def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
         )
         hint = "make it RELIABLE, or mark the publishers of the topic"
         yield note("check.flow-dscp", need.at, message, hint)
-    for advice in each.marking.notes:
-        message, _, hint = advice.partition("; ")
-        yield note("check.five-qi-class", need.at, message, hint)
 
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, marking_of
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     EndpointKind,
@@ -17,7 +17,7 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.network.five_qi import dscp_mapping, five_qi_of
+from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 from tests.builders import at, link, manifest, need, node, publisher, subscription
 
@@ -177,23 +177,6 @@ def test_network_transport_is_ipv6_where_the_machine_s_address_is():
         assert [each.transports for each in FlowNeeds(system).groups(only)] == [transports]
 
 
-# --- marks
-
-
-def test_a_5qi_marks_only_where_a_mapping_is_asked_for():
-    asked = need(PUB, "a", five_qi=82)
-    mapping = dscp_mapping("azure_private_5g_core")
-    assert marking_of(asked, Network(), 82).dscp is None
-    marking = marking_of(asked, Network(five_qi_dscp=mapping), 82)
-    assert marking.dscp == mapping.dscp_for(82) == 18
-    assert marking.reason == "for 5QI 82 by mapping 'azure_private_5g_core'"
-
-
-def test_a_dscp_that_is_written_wins_over_the_mapping_of_the_5qi():
-    network = Network(five_qi_dscp=dscp_mapping("azure_private_5g_core"))
-    assert marking_of(need(PUB, "a", five_qi=82, dscp=46), network, 82).dscp == 46
-
-
 # --- 5QI
 
 
@@ -233,8 +216,6 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(CORPUS)
     system = load("flows_every_key.lifecycle.yaml").manifest
     network = system.network
-    assert network.five_qi_dscp is not None
-    assert network.five_qi_dscp.values == ((82, 34), (85, 46))
     assert network.max_datagram_bytes == 1300
     video, pose, alarm, log = system.nodes[0].flows
     assert (video.unique, video.dscp, video.enforce) == (STRICTLY, 46, False)
