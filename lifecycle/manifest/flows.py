@@ -19,7 +19,6 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Manifest,
     Node,
-    RunKind,
 )
 from lifecycle.manifest.names import topic_of
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
@@ -118,8 +117,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
         transports: all that its participant may use; empty for any.
-        identified_by_receiver: every subscription of its topic asks for an NFE of its own, which
-            identifies the flow (weakly unique) whatever the publisher has.
     """
 
     need: FlowNeed
@@ -129,7 +126,6 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     max_delay_ms: float | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
-    identified_by_receiver: bool = False
 
     @property
     def dscp(self) -> int | None:
@@ -157,7 +153,7 @@ class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
         five_qi: the class by which a network distinguishes it; None if it need not.
     """
 
-    kind: EndpointKind = EndpointKind.PUBLISHER
+    kind: EndpointKind
     names: tuple[str, ...]
     unique: bool
     dscp: int | None
@@ -172,7 +168,6 @@ class FlowNeeds:
 
     def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
-        self._machines = {each.key: each.machine for each in manifest.nodes}
         self._delays: dict[tuple[str, str], float] = {}
         for link in manifest.links:
             if link.max_delay_ms is not None:
@@ -180,13 +175,11 @@ class FlowNeeds:
                 self._delays[place] = min(
                     link.max_delay_ms, self._delays.get(place, link.max_delay_ms)
                 )
-        self._identified_by_receiver = _identified_by_receiver(manifest)
-        resolved = {
+        self._resolved = {
             (node.key, need.kind, need.name): self._resolve(node, need)
             for node in manifest.nodes
             for need in node.flows
         }
-        self._resolved = {key: self._with_datagrams(key[0], each) for key, each in resolved.items()}
 
     def of(self, node_key: str, kind: EndpointKind, name: str) -> ResolvedNeed | None:
         """Return the need of an endpoint by its declared name; None if it has none."""
@@ -226,21 +219,18 @@ class FlowNeeds:
             each = self.of(node.key, endpoint.kind, endpoint.name)
             if each is None or not endpoint.kind.is_topic:
                 continue
-            if endpoint.kind is EndpointKind.SUBSCRIPTION:
-                if each.dscp is not None:
-                    _add_subscription(found, each, each.transports or own[2])
-                continue
-            five_qi = None if each.unique or each.identified_by_receiver else each.five_qi
-            transports = each.transports or own[2]
+            unique = each.unique and endpoint.kind is EndpointKind.PUBLISHER
+            five_qi, transports = None if each.unique else each.five_qi, each.transports or own[2]
             class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
-            if not each.unique and class_ == own and each.max_datagram_bytes is None:
+            if not unique and class_ == own and each.max_datagram_bytes is None:
                 continue
-            key = endpoint.name if each.unique else class_
+            key = endpoint.name if unique else (endpoint.kind, class_)
             known = found.get(key)
             sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
             found[key] = ParticipantGroup(
+                kind=endpoint.kind,
                 names=(*(known.names if known else ()), endpoint.name),
-                unique=each.unique,
+                unique=unique,
                 dscp=each.dscp,
                 five_qi=five_qi,
                 transports=transports,
@@ -253,15 +243,15 @@ class FlowNeeds:
         topic = topic_of(node, need.name, need.kind)
         delay = self._max_delay_ms(node, need, topic)
         flow_class = class_of(need, max_delay_ms=delay)
-        return ResolvedNeed(
+        resolved = ResolvedNeed(
             need=need,
             topic=topic,
             unique=need.unique.asks,
             flow_class=flow_class,
             max_delay_ms=delay,
             transports=self._transports(node) if self._by_participant(need) else (),
-            identified_by_receiver=topic in self._identified_by_receiver,
         )
+        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(node, resolved))
 
     def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
         if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
@@ -283,48 +273,14 @@ class FlowNeeds:
     def _transports(self, node: Node) -> tuple[Medium, ...]:
         return (udp_to(self._manifest.address_of(node.machine)),)
 
-    def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
+    def _max_datagram_bytes(self, node: Node, each: ResolvedNeed) -> int | None:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
-            return each
+            return None
         declared = self._manifest.network.max_datagram_bytes
-        ipv6 = ":" in self._manifest.address_of(self._machines[node_key])
+        ipv6 = ":" in self._manifest.address_of(node.machine)
         limit = declared or max_unfragmented(ipv6=ipv6)
         size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)
-        if small:
-            return each
-        return replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
-
-
-def _add_subscription(
-    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[Medium, ...]
-) -> None:
-    key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
-    known = found.get(key)
-    found[key] = ParticipantGroup(
-        kind=EndpointKind.SUBSCRIPTION,
-        names=(*(known.names if known else ()), each.need.name),
-        unique=False,
-        dscp=each.dscp,
-        five_qi=None,
-        transports=transports,
-        max_datagram_bytes=None,
-        non_blocking_send=False,
-    )
-
-
-def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
-    """Topics whose every subscription gets an NFE of its own."""
-    answers: dict[str, bool] = {}
-    for node in manifest.nodes:
-        needs = {need.name: need for need in node.flows if need.kind is EndpointKind.SUBSCRIPTION}
-        for endpoint in node.interface.endpoints:
-            if endpoint.kind is not EndpointKind.SUBSCRIPTION:
-                continue
-            topic = topic_of(node, endpoint.name, endpoint.kind)
-            need = needs.get(endpoint.name)
-            own = need is not None and need.unique.asks and node.run.kind is RunKind.PYTHON
-            answers[topic] = answers.get(topic, True) and own
-    return frozenset(topic for topic, every in answers.items() if every)
+        return None if small else declared or SAFE_DATAGRAM_BYTES

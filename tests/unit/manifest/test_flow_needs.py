@@ -14,8 +14,6 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Machine,
     Network,
-    Run,
-    RunKind,
 )
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
@@ -87,30 +85,6 @@ def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
     needs = FlowNeeds(manifest(only))
     assert needs.node_transports(only) == ("udpv4",)
     assert [(each.names, each.transports) for each in needs.groups(only)] == [(("c",), ("udpv4",))]
-
-
-def class_of_the_publisher(*hearers: FlowNeed | None, run: RunKind = RunKind.PYTHON):
-    source = node("source", publisher("a"), needs=[need(PUB, "a", five_qi=82)])
-    others = [
-        node(
-            f"hearer{index}",
-            subscription("a"),
-            needs=[each] if each else [],
-            run=Run(kind=run, python="m:C", command=("x",)),
-        )
-        for index, each in enumerate(hearers)
-    ]
-    return [each.five_qi for each in FlowNeeds(manifest(source, *others)).groups(source)]
-
-
-def test_a_5qi_needs_sockets_of_its_own_unless_the_subscriptions_tell_the_flow_apart():
-    unique = need(SUB, "a", STRICTLY)
-    assert class_of_the_publisher(unique) == []
-    assert class_of_the_publisher(unique, unique) == []
-    assert class_of_the_publisher(unique, None) == [82]
-    assert class_of_the_publisher(None) == [82]
-    assert class_of_the_publisher() == [82]
-    assert class_of_the_publisher(unique, run=RunKind.COMMAND) == [82]
 
 
 def test_publishers_of_one_5qi_share_and_of_two_do_not():
