@@ -339,8 +339,6 @@ class _Loading:
         )
         found = substitute(document, given, surroundings, include=entry)
         self.found += found.diagnostics
-        for place in found.left_out:
-            self.found += _misspelt(document, place)
         return found
 
     def _contents(
@@ -462,15 +460,6 @@ class _Loading:
             stem = name.removesuffix(".yaml").removesuffix(".yml")
             hint = f"rename it to {stem}{SUFFIX}"
             self.found.append(note("manifest.suffix", at, message, hint))
-
-
-def _misspelt(document: Document, place: Place) -> tuple[Diagnostic, ...]:
-    """Return what is wrong with something that is left out, whatever its substitutions become."""
-    part = document.get(*place)
-    if part is None:
-        return ()
-    kind = str(place[-2]).removesuffix("s").capitalize()
-    return validate(part, definition=kind, is_resolved=False)
 
 
 def _keys_of(group: Value) -> Iterator[str]:

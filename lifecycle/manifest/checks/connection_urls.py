@@ -1,7 +1,6 @@
-"""Checks of connection URLs: conflicting ports, addresses of the machine, peers, combined URLs.
+"""Checks of connection URLs: conflicting ports, addresses of the machine, combined URLs.
 
-Owns: check.connection-ports, check.connection-address, check.connection-peer,
-check.connection-urls. Pure.
+Owns: check.connection-ports, check.connection-address, check.connection-urls. Pure.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from lifecycle.manifest.model import (
     EndpointKind,
     Node,
 )
-from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
+from lifecycle.manifest.yaml.document import error
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, check_together
 from lifecycle.network.nfe import is_loopback, may_be_same
 from lifecycle.network.ports import DG, domain_base, owner_of
 
@@ -46,15 +45,12 @@ class _Use(msgspec.Struct, frozen=True, kw_only=True):
 def check_urls(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the URLs of every declared connection."""
     uses: list[_Use] = []
-    contacts: set[tuple[str, int]] = set()
     for node, connection, url, at in _urls(system):
         uses += _uses(system, node, connection, url, at)
-        contacts |= _contacts(system, node, url)
         yield from _own_address(system, node, url, at)
     yield from _collisions(uses)
     yield from _well_known(system, uses)
     for node, connection, url, at in _urls(system):
-        yield from _peers(system, url, at, contacts)
         yield from _loopback(system, node, connection, url, at)
     for node in system.manifest.nodes:
         for connection in node.connections:
@@ -96,26 +92,6 @@ def _uses(
             what=f"{word} of connection {connection.name!r} of {node.key!r}",
             at=at,
         )
-
-
-def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
-    """Return where a connection's discovery is reached, by every address of its host."""
-    tcp = url.transport.is_tcp
-    port = url.port if tcp else url.metatraffic_port
-    if port is None:
-        return set()
-    own = "" if url.transport.is_group else url.address
-    addresses = (
-        {own}
-        if own and not ipaddress.ip_address(own).is_unspecified
-        else {
-            system.manifest.address_of(node.machine),
-            "127.0.0.1",
-            "::1",
-            *url.interfaces,
-        }
-    )
-    return {(address, port) for address in addresses}
 
 
 def _own_address(
@@ -177,29 +153,6 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
         base = domain_base(domain)
         hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
         yield error("check.connection-ports", use.at, message, hint)
-
-
-def _peers(
-    system: DeclaredSystem, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
-) -> Iterator[Diagnostic]:
-    """Warn of peers that match no participant of the system."""
-    discovery = system.manifest.discovery
-    planned = discovery.mode is not DiscoveryMode.DYNAMIC and not discovery.transport.in_memory
-    domain = domain_base(discovery.domain_id or 0)
-    for peer in url.peers:
-        if peer.port is None or planned or domain <= peer.port < domain + DG:
-            continue
-        if (peer.address, peer.port) in contacts:
-            continue
-        near = sorted(port for address, port in contacts if address == peer.address)
-        spelled = ", ".join(str(Peer(address=peer.address, port=each)) for each in near)
-        message = f"cannot find a participant of this system at {str(peer)!r}"
-        hint = (
-            f"planned there: {spelled}"
-            if near
-            else "no connection listens at that address: 'metatraffic_port' is what peers name"
-        )
-        yield warning("check.connection-peer", at, message, hint)
 
 
 def _loopback(
