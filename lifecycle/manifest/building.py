@@ -7,7 +7,6 @@ Pure but for reading interfaces by reference.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,11 +30,9 @@ from lifecycle.manifest.model import (
     Condition,
     ConnectionDeclaration,
     Consequence,
-    DataLayer,
     EndpointKind,
     Executor,
     FlowNeed,
-    Health,
     Interface,
     MeasuredKeys,
     Mode,
@@ -62,18 +59,6 @@ from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
-
-
-def build_data_layer(root: Document, found: list[Diagnostic]) -> DataLayer:
-    """Build the data layer of a document; the defaults where it declares nothing."""
-    layer = read_part(root, DataLayer, ("data_layer",))
-    group = layer.multicast_group
-    if not _is_ipv4_group(group):
-        at = root.at(("data_layer", "multicast_group"))
-        message = f"cannot use {quote(group)} as a multicast group; it must be IPv4"
-        hint = "239.255.0.0 to 239.255.255.255 stay within an organisation (RFC 2365)"
-        found.append(error("manifest.multicast-group", at, message, hint))
-    return layer
 
 
 def build_on_violation(section: Document) -> OnViolation:
@@ -116,13 +101,6 @@ def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
         found[".".join(steps)] = each.key_at() if is_named else each.at()
         pending += [((*steps, key), inside) for key, inside in each.children()]
     return found
-
-
-def _is_ipv4_group(text: str) -> bool:
-    try:
-        return ipaddress.IPv4Address(text).is_multicast
-    except ValueError:
-        return False
 
 
 def build_connections(
@@ -230,7 +208,6 @@ def build_node(
         after=tuple(_after(part, shared, found)),
         supervision=build(Supervision, node),
         on_violation=build_on_violation(part),
-        health=None if node.health is None else _health(node.health),
         interface=interface,
         flows=tuple(_flows(part)),
         connections=build_connections(part, interface, found),
@@ -375,11 +352,6 @@ def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
         )
         for name, mode in root.entries("modes")
     )
-
-
-def _health(health: written.Health) -> Health:
-    patterns = health.diagnostics or ()
-    return build(Health, health, diagnostics=(patterns,) if isinstance(patterns, str) else patterns)
 
 
 def _flows(node: Document) -> Iterator[FlowNeed]:

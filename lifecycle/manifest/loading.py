@@ -19,7 +19,6 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.building import (
-    build_data_layer,
     build_modes,
     build_node,
     build_on_violation,
@@ -35,6 +34,7 @@ from lifecycle.manifest.diagnostics import (
     in_order,
 )
 from lifecycle.manifest.model import (
+    DataLayer,
     Discovery,
     EndpointKind,
     Link,
@@ -306,7 +306,7 @@ class _Loading:
             description=document.text("description"),
             discovery=read_part(document, Discovery, ("discovery",)),
             network=read_part(document, Network, ("network",)),
-            data_layer=build_data_layer(document, self.found),
+            data_layer=read_part(document, DataLayer, ("data_layer",)),
             policy=read_part(document, Policy, ("policy",)),
             on_violation=build_on_violation(document),
             modes=build_modes(document, self.found),

@@ -219,6 +219,14 @@ Text = Annotated[str, Meta(min_length=1)]
 NodeKey = Annotated[
     str, spelled(rf"^{WORD}(/{WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
 ]
+_OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])"
+IPv4Group = Annotated[
+    str,
+    spelled(
+        rf"^(22[4-9]|23[0-9])(\.{_OCTET}){{3}}\Z",
+        "write an IPv4 group; 239.255.* stay within an organisation (RFC 2365)",
+    ),
+]
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
@@ -895,7 +903,7 @@ class DataLayer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     authority: Authority = Authority.NODES
     source: DataLayerSource = DataLayerSource.STATIC
     events: bool = False
-    multicast_group: Text = "239.255.1.1"
+    multicast_group: IPv4Group = "239.255.1.1"
 
 
 class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

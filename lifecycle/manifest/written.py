@@ -20,6 +20,7 @@ from lifecycle.manifest.model import (
     Dscp,
     EndpointPolicy,
     Executor,
+    Health,
     LinkKeys,
     Network,
     NodeKey,
@@ -36,7 +37,6 @@ from lifecycle.manifest.model import (
     require,
     spelled,
 )
-from lifecycle.manifest.model import Health as NodeHealth
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
@@ -487,19 +487,6 @@ InterfaceReference = Annotated[
         examples=["local://camera.nodl.yaml"],
     ),
 ]
-
-
-class Health(NodeHealth, frozen=True, kw_only=True):
-    """What shows whether the node is healthy, which it then must be (rule node.unhealthy)."""
-
-    ANY_OF: ClassVar[Ways] = (("check",), ("diagnostics",))
-
-    check: bool | None = None  # type: ignore[assignment]
-    diagnostics: Text | Annotated[tuple[Text, ...], Meta(min_length=1)] | None = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        """Raise ValueError unless something shows it."""
-        require(_written(self, self.ANY_OF) > 0)
 
 
 Level = Literal["started", "configured", "connected", "active", "healthy"]
