@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,9 +74,13 @@ def _show(value: ParameterValue) -> str:
 
 def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
+    names: dict[str, set[str]] = {}
+    for node in system.manifest.nodes:
+        names.setdefault(node.process_name, set()).add(node.name)
     for node in system.manifest.nodes:
         yield from _given(node)
         yield from _no_effect(node)
+        yield from _for_no_node(node, names[node.process_name])
         yield from _empty_arrays(node, system)
 
 
@@ -104,6 +108,20 @@ def _given(node: Node) -> Iterator[Diagnostic]:
         if problem := misfit(read, declaration.type):
             message = f"cannot set parameter {each.name!r} of {node.key!r} by '-p' to {problem}"
             yield error("check.parameter-type", at, message, suggestion(read, declaration.type))
+
+
+def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
+    """Warn of values on a command line for a node that its process is not declared to have."""
+    at = node.where("run.command")
+    for each in command_line_parameters(node):
+        if each.node and each.node not in names:
+            message = (
+                f"cannot tell what takes '-p {each.node}:{each.name}': no node {each.node!r} is "
+                f"declared in the process of {node.key!r}"
+            )
+            listed = ", ".join(map(repr, sorted(names)))
+            hint = did_you_mean(each.node, names) or f"declared there: {listed}"
+            yield warning("check.parameter-for-no-node", at, message, hint)
 
 
 def _empty_arrays(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -268,6 +286,8 @@ def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 at = node.where(f"parameter_files.{index}")
                 yield from _flaws(path, system.files.read(path), at)
             readers.setdefault(path, []).append(node)
+    for node in system.manifest.nodes:
+        yield from _unmatched_file_of_command(node, system)
     for path, nodes in readers.items():
         file = system.files.read(path)
         for node in () if file.flaws else nodes:
@@ -295,6 +315,28 @@ def _unmatched_node(path: str, file: ParameterFile, node: Node) -> Iterator[Diag
     message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
     hint = f"name the section {name}, or /** for every node"
     yield warning("check.parameter-file-unmatched", at, message, hint)
+
+
+def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
+    paths = [each.file for each in command_line_parameters(node) if each.file]
+    if not paths:
+        return
+    process = node.process_name
+    every = [each.full_name for each in system.manifest.nodes]
+    names = [e.full_name for e in system.manifest.nodes if process == e.process_name]
+    for file in map(system.files.read, paths):
+        at = node.where("run.command")
+        mine = [each for each in file.sections if any(map(each.matches, names))]
+        # One file for many processes has sections for the nodes of others.
+        for section in file.sections:
+            if not mine or not any(map(section.matches, every)):
+                message = (
+                    f"cannot use the parameters of {section.pattern!r} in {file.shown!r}: no node "
+                    f"of the process of {node.key!r} has that name"
+                )
+                hint = did_you_mean(section.pattern, names)
+                yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
 def _unmatched_sections(file: ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
