@@ -311,70 +311,67 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
         require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
-class TopicEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One publisher or subscription.
+def _interface_type(kind: str, example: str) -> Meta:
+    message = f"write package/{kind}/Type, as in {example}"
+    return Meta(
+        pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
+        examples=[example],
+        extra_json_schema={"patternErrorMessage": message},
+    )
+
+
+class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One endpoint.
 
     Attributes:
         name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
             remapping.
-        type: ROS type, package/msg/Type.
         description: What it is for; for people.
-        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
-            make the endpoint with; nothing requires them.
     """
 
     name: Text
-    type: Annotated[
-        str,
-        spelled(rf"^{_TYPE}/msg/{_TYPE}\Z", "write package/msg/Type, as in sensor_msgs/msg/Image"),
-        Meta(examples=["sensor_msgs/msg/Image"]),
-    ]
     description: str = ""
-    qos: Preset | Qos | None = None
 
 
-class ServiceEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One server or client of a service.
-
-    Attributes:
-        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
-            remapping.
-        type: ROS type, package/srv/Type.
-        description: What it is for; for people.
-        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
-            make the endpoint with; nothing requires them.
-    """
-
-    name: Text
-    type: Annotated[
-        str,
-        spelled(rf"^{_TYPE}/srv/{_TYPE}\Z", "write package/srv/Type, as in std_srvs/srv/Trigger"),
-        Meta(examples=["std_srvs/srv/Trigger"]),
-    ]
-    description: str = ""
-    qos: Preset | Qos | None = None
-
-
-class ActionEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
     """One server or client of an action.
 
     Attributes:
-        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
-            remapping.
         type: ROS type, package/action/Type.
-        description: What it is for; for people.
     """
 
-    name: Text
-    type: Annotated[
-        str,
-        spelled(
-            rf"^{_TYPE}/action/{_TYPE}\Z",
-            "write package/action/Type, as in example_interfaces/action/Fibonacci",
-        ),
-        Meta(examples=["example_interfaces/action/Fibonacci"]),
-    ]
-    description: str = ""
+    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
+
+
+class QosEndpoint(Endpoint, frozen=True, kw_only=True):
+    """One endpoint of a topic or service.
+
+    Attributes:
+        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
+            make the endpoint with; nothing requires them.
+    """
+
+    qos: Preset | Qos | None = None
+
+
+class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
+    """One server or client of a service.
+
+    Attributes:
+        type: ROS type, package/srv/Type.
+    """
+
+    type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
+
+
+class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
+    """One publisher or subscription.
+
+    Attributes:
+        type: ROS type, package/msg/Type.
+    """
+
+    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
 
 Preset = Literal[
