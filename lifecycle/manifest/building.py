@@ -8,7 +8,6 @@ Pure but for reading interfaces by reference.
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -279,7 +278,7 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
         extra_arguments=_values(part, "extra_arguments", found),
         environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
         working_directory=absolute(base, run.working_directory) if run.working_directory else "",
-        prefix=_words(part, "prefix", found),
+        prefix=tuple(each.root.text for each in part.items("prefix")),
         resources=_resources(part, run, found),
         container=_container(run.container or "", shared),
     )
@@ -319,22 +318,6 @@ def _refuse(
         if name in run:
             message = f"cannot set {name} of {what}"
             found.append(error(rule, run.key_at((name,)), message, "remove it"))
-
-
-def _words(run: Document, key: str, found: Findings) -> tuple[str, ...]:
-    """Return the words of a list, or of a text as a shell splits it."""
-    part = run.get(key)
-    if part is None:
-        return ()
-    if isinstance(part.root.data, tuple):
-        return tuple(each.root.text for each in part.items())
-    try:
-        return tuple(shlex.split(part.root.text))
-    except ValueError as problem:
-        message = f"cannot split {key} {quote(part.root.text)} into words: {problem}"
-        hint = "close the quotation, or write a list of words"
-        found.append(error("manifest.words", part.at(), message, hint))
-        return ()
 
 
 def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:

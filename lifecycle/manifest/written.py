@@ -230,8 +230,7 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
             others start.
         extra_arguments: Extra arguments of the request that loads 'component' (LoadNode.srv), as
             'use_intra_process_comms' of rclcpp_components.
-        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf;
-            one text is split as a shell does.
+        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf.
         resources: What the process and all that it starts may use together, as
             systemd.resource-control(5); set by systemd where that runs, else unverifiable.
     """
@@ -299,8 +298,8 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
     extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
     prefix: (
         Annotated[
-            Text | Annotated[tuple[Scalar, ...], Meta(min_length=1)],
-            Meta(examples=[["gdb", "-ex", "run", "--args"], "nice -n 5"]),
+            tuple[Scalar, ...],
+            Meta(min_length=1, examples=[["gdb", "-ex", "run", "--args"], ["nice", "-n", 5]]),
         ]
         | None
     ) = None

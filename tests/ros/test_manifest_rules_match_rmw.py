@@ -21,7 +21,6 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
-    RemapRuleError,
     expand,
     full_name_problem,
     name_problem,
@@ -263,7 +262,7 @@ def test_a_rule_is_legal_exactly_when_rcl_reads_it(rule: str) -> None:
     try:
         context.init(args=["--ros-args", "-r", rule])
     except rcl.RCLError:
-        with pytest.raises(RemapRuleError):
+        with pytest.raises(NameNotLegalError):
             parse_rule(match, replacement)
     else:
         context.shutdown()

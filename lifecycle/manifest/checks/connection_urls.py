@@ -1,7 +1,4 @@
-"""Checks of connection URLs: conflicting ports, combined URLs.
-
-Owns: check.connection-ports, check.connection-urls. Pure.
-"""
+"""Checks of connection URLs: conflicting ports, combined URLs. Pure."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 """Checks that endpoints have counterparts that match, and of the `connections:` that nodes declare.
 
-Owns: check.unpublished, check.unheard, check.no-server, whose severity is the manifest's policy;
-check.qos-incompatible, check.qos-doubtful, by the rule of `lifecycle.manifest.qos`;
-check.type-unknown, check.type-not-installed, check.type-mismatch, which read the ament index;
-check.connection-endpoint, check.connection-name, check.connection-foreign, check.connection-flow.
-Addresses and ports of connections are checked by `connection_urls`.
+QoS is judged by the rule of `lifecycle.manifest.qos`; types are looked up in the ament index.
 """
 
 from __future__ import annotations

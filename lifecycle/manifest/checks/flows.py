@@ -1,10 +1,4 @@
-"""Checks of network flow needs: DSCP, 5QI, and links.
-
-Owns: check.flow-unknown-endpoint, check.flow-dscp, check.flow-five-qi, check.five-qi-class,
-check.flow-impossible, check.flow-foreign; check.link-unknown-node, check.link-topic,
-check.link-not-unique: the ends of a link exist, meet on the topic, and ask for what the link
-demands. Pure.
-"""
+"""Checks of network flow needs: DSCP and 5QI; of links, whose ends must exist and ask. Pure."""
 
 from __future__ import annotations
 
@@ -25,7 +19,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -94,21 +87,6 @@ def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
         make = error if issue.field in _KEPT_BY_CLASS else note
         hint = "choose another class, or write 'five_qi: auto'"
         yield make("check.five-qi-class", need.at, issue.message, hint)
-    if need.five_qi is None or class_.five_qi is None:
-        return
-    try:
-        known = five_qi_of(class_.five_qi)
-    except ValueError:
-        message = (
-            f"cannot check what {need.name!r} declares against 5QI {need.five_qi}: 128 to 254 are "
-            f"an operator's own"
-        )
-        if each.max_delay_ms is not None or need.loss is not None:
-            yield note("check.five-qi-class", need.at, message, "ask that operator")
-        return
-    if known.flagged:
-        message = f"cannot be sure of {', '.join(known.flagged)} of {known}: {known.note}"
-        yield note("check.five-qi-class", need.at, message, "choose another, or ask the operator")
 
 
 def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:

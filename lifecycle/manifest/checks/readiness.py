@@ -1,7 +1,4 @@
-"""Checks of what nodes wait for that others show in the graph: what they can never show.
-
-Owns: check.after-undeclared, check.after-value. Pure.
-"""
+"""Checks of what nodes wait for that others show in the graph: what they can never show. Pure."""
 
 from __future__ import annotations
 

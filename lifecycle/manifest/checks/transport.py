@@ -1,11 +1,7 @@
 """Checks of discovery and transport: range, RMW, discovery server, media of flows, datagram sizes.
 
-Owns: check.discovery-range, check.discovery-address, check.discovery-rmw,
-check.discovery-transport, check.discovery-server, check.discovery-foreign, check.authority;
-check.flow-transport, check.flow-fragments, check.ipv6-transports, check.rmw. The capability
-table is in `lifecycle.network`; what happens at run time decides, check.rmw only fails earlier.
-Whether two nodes have a transport in common is the planner's to say (plan.unconnectable).
-Pure.
+What happens at run time decides; check.rmw only fails earlier.
+Whether two nodes have a transport in common is the planner's to say (plan.unconnectable). Pure.
 """
 
 from __future__ import annotations
