@@ -1,19 +1,15 @@
-"""Validated `nodes:`, `network:`, `data_layer:`, `modes:` and `connections:` → frozen types.
+"""Validated `nodes:`, `data_layer:`, `modes:` and `connections:` → frozen types.
 
 Owns: how a node's keys become fields, its parameters flat and its paths absolute; reading
 connection URLs out of a document; and the findings about all of them that a schema cannot detect.
-Pure but for reading interfaces and mappings by reference.
+Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import os
-import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-
-import msgspec
 
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -33,17 +29,13 @@ from lifecycle.manifest.model import (
     Condition,
     ConnectionDeclaration,
     Consequence,
-    DataLayer,
     EndpointKind,
     Executor,
     FlowNeed,
-    Health,
     Interface,
     MeasuredKeys,
     Mode,
     ModeParameter,
-    Network,
-    NetworkKeys,
     Node,
     OnViolation,
     ParameterValue,
@@ -60,83 +52,12 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.manifest.shared import Shared
-from lifecycle.manifest.written import build, read, read_part
+from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.document import Document, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
-
-
-_MAX_MAPPING_BYTES = 1_000_000
-
-
-def build_network(root: Document, *, base: Path, found: list[Diagnostic]) -> Network:
-    """Build the network of a document; the defaults where it declares nothing.
-
-    Args:
-        root: the document.
-        base: folder that the path of a mapping starts from.
-        found: findings are appended here.
-    """
-    network = root.get("network")
-    if network is None:
-        return Network()
-    keys = network.plain()
-    mapping = keys.pop("transport_priority_mapping", None)
-    return build(
-        Network,
-        read(keys, NetworkKeys, strict=False),
-        transport_priority_mapping=None if mapping is None else _priority_mapping(network, found),
-        five_qi_dscp=_dscp_mapping(network, base, found) if "five_qi_dscp" in network else None,
-    )
-
-
-def _priority_mapping(
-    network: Document, found: list[Diagnostic]
-) -> TransportPriorityMapping | None:
-    place = ("transport_priority_mapping",)
-    try:
-        return read_part(network, TransportPriorityMapping, place)
-    except msgspec.ValidationError as problem:
-        message, _, hint = str(problem.__cause__).partition("; ")
-        found.append(error("manifest.transport-priority", network.at(place), message, hint))
-        return None
-
-
-def _dscp_mapping(network: Document, base: Path, found: list[Diagnostic]) -> DscpMapping | None:
-    """Read a mapping: a published one by its name, else a file."""
-    name = network.text("five_qi_dscp")
-    shipped = {each.name: each for each in dscp_mappings()}
-    if name in shipped:
-        return shipped[name]
-    try:
-        with (base / name).open("rb") as file:
-            text = file.read(_MAX_MAPPING_BYTES)
-        return parse_mapping(text)
-    except OSError as problem:
-        message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {problem.strerror}"
-        hint = f"name a file, or a published mapping: {', '.join(shipped)}"
-    except ValueError as problem:
-        why = problem.__cause__ or problem
-        message = f"cannot use {quote(name)} as a 5QI to DSCP mapping: {why}"
-        hint = 'write {"name": …, "source": …, "values": {"85": "EF"}}'
-    found.append(error("manifest.five-qi-dscp", network.at(("five_qi_dscp",)), message, hint))
-    return None
-
-
-def build_data_layer(root: Document, found: list[Diagnostic]) -> DataLayer:
-    """Build the data layer of a document; the defaults where it declares nothing."""
-    layer = read_part(root, DataLayer, ("data_layer",))
-    group = layer.multicast_group
-    if not _is_ipv4_group(group):
-        at = root.at(("data_layer", "multicast_group"))
-        message = f"cannot use {quote(group)} as a multicast group; it must be IPv4"
-        hint = "239.255.0.0 to 239.255.255.255 stay within an organisation (RFC 2365)"
-        found.append(error("manifest.multicast-group", at, message, hint))
-    return layer
 
 
 def build_on_violation(section: Document) -> OnViolation:
@@ -179,13 +100,6 @@ def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
         found[".".join(steps)] = each.key_at() if is_named else each.at()
         pending += [((*steps, key), inside) for key, inside in each.children()]
     return found
-
-
-def _is_ipv4_group(text: str) -> bool:
-    try:
-        return ipaddress.IPv4Address(text).is_multicast
-    except ValueError:
-        return False
 
 
 def build_connections(
@@ -293,7 +207,6 @@ def build_node(
         after=tuple(_after(part, shared, found)),
         supervision=build(Supervision, node),
         on_violation=build_on_violation(part),
-        health=None if node.health is None else _health(node.health),
         interface=interface,
         flows=tuple(_flows(part)),
         connections=build_connections(part, interface, found),
@@ -365,7 +278,7 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
         extra_arguments=_values(part, "extra_arguments", found),
         environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
         working_directory=absolute(base, run.working_directory) if run.working_directory else "",
-        prefix=_words(part, "prefix", found),
+        prefix=tuple(each.root.text for each in part.items("prefix")),
         resources=_resources(part, run, found),
         container=_container(run.container or "", shared),
     )
@@ -407,22 +320,6 @@ def _refuse(
             found.append(error(rule, run.key_at((name,)), message, "remove it"))
 
 
-def _words(run: Document, key: str, found: Findings) -> tuple[str, ...]:
-    """Return the words of a list, or of a text as a shell splits it."""
-    part = run.get(key)
-    if part is None:
-        return ()
-    if isinstance(part.root.data, tuple):
-        return tuple(each.root.text for each in part.items())
-    try:
-        return tuple(shlex.split(part.root.text))
-    except ValueError as problem:
-        message = f"cannot split {key} {quote(part.root.text)} into words: {problem}"
-        hint = "close the quotation, or write a list of words"
-        found.append(error("manifest.words", part.at(), message, hint))
-        return ()
-
-
 def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
     """Build the modes of a document."""
     return tuple(
@@ -438,11 +335,6 @@ def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
         )
         for name, mode in root.entries("modes")
     )
-
-
-def _health(health: written.Health) -> Health:
-    patterns = health.diagnostics or ()
-    return build(Health, health, diagnostics=(patterns,) if isinstance(patterns, str) else patterns)
 
 
 def _flows(node: Document) -> Iterator[FlowNeed]:

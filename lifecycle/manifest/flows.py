@@ -1,14 +1,13 @@
-"""Effective flow needs of endpoints: DSCP, 5QI, datagrams and transport after mappings and links.
+"""Effective flow needs of endpoints: 5QI, datagrams and transport after links.
 
 Owns: `FlowNeeds`, which the checks and the planner both read, so that `check` judges what `plan`
 will do; `five_qi: auto`, and whether a class keeps what is declared (the table is in
-`lifecycle.network`); the ways to a DSCP besides writing it: a TRANSPORT_PRIORITY through its
-mapping, a 5QI through a mapping, and a value of its own where the DSCP is the identifier. Pure.
+`lifecycle.network`). Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import msgspec
 from msgspec.structs import replace
@@ -16,23 +15,12 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
-    FlowIdentification,
     FlowNeed,
     FlowTransport,
     Manifest,
-    Network,
     Node,
-    RunKind,
 )
 from lifecycle.manifest.names import topic_of
-from lifecycle.network.dscp import (
-    ECN_MASK,
-    MAX_DSCP,
-    TransportPriorityMapping,
-    code_points,
-    describe,
-    map_priority,
-)
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
 from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
@@ -117,93 +105,6 @@ def _proposed(
     return FlowClass(five_qi=proposal.five_qi.value, reason=proposal.why)
 
 
-DIRECT = TransportPriorityMapping(mask=0xFF)
-"""Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
-
-
-class Marking(msgspec.Struct, frozen=True, kw_only=True):
-    """A DSCP and its source.
-
-    Attributes:
-        dscp: 0–63; None if nothing is marked.
-        reason: one phrase for people; empty where the DSCP is written as such.
-        problem: message and hint of why the need cannot be met; two empty texts if it can.
-        notes: what a user should know, one sentence each, each starting with "cannot".
-    """
-
-    dscp: int | None = None
-    reason: str = ""
-    problem: tuple[str, str] = ("", "")
-    notes: tuple[str, ...] = ()
-
-
-def marking_of(need: FlowNeed, network: Network, five_qi: int | None) -> Marking:
-    """Return the marking of one endpoint.
-
-    The priority of a publisher is of its data, that of a subscription of its acknowledgements, and
-    neither follows from the other (*RTI Connext Micro, Transport Priority*, "Configuring transport
-    priority"). A 5QI is of data and marks publishers only.
-
-    Args:
-        need: what it asks for.
-        network: the system's mappings.
-        five_qi: its 5QI, `auto` resolved.
-    """
-    if need.transport_priority is not None and need.dscp is None:
-        mapping = network.transport_priority_mapping or DIRECT
-        return _mapped(need.transport_priority, mapping)
-    publishes = need.kind is EndpointKind.PUBLISHER
-    if need.dscp is not None or not publishes or network.five_qi_dscp is None or five_qi is None:
-        return Marking(dscp=need.dscp)
-    name, dscp = network.five_qi_dscp.name, network.five_qi_dscp.dscp_for(five_qi)
-    if dscp is None:
-        return Marking(notes=(f"cannot mark 5QI {five_qi} with a DSCP: mapping {name!r} has none",))
-    return Marking(dscp=dscp, reason=f"for 5QI {five_qi} by mapping {name!r}")
-
-
-def _mapped(number: int, mapping: TransportPriorityMapping) -> Marking:
-    result = map_priority(number, mapping)
-    priority = f"transport_priority {number} ({number:#x})"
-    through = f"mask {mapping.mask:#x}, low {mapping.low:#x}, high {mapping.high:#x}"
-    if result.tos is None:
-        return Marking(notes=(f"cannot mark anything with {priority}: the mask is 0",))
-    if result.sets_ecn:
-        clear = result.tos & ~ECN_MASK
-        message = (
-            f"cannot use {priority}: with {through} it is TOS {result.tos} ({result.tos:#04x}), "
-            f"whose two lowest bits are ECN and belong to the transport (RFC 3168)"
-        )
-        return Marking(problem=(message, f"without them it is {describe(clear >> 2)}"))
-    note = (
-        f"cannot map bits {result.ignored_bits:#x} of {priority}: they are outside mask "
-        f"{mapping.mask:#x}; what is left is {describe(result.tos >> 2)}"
-    )
-    return Marking(
-        dscp=result.tos >> 2,
-        reason=f"{priority} with {through}",
-        notes=(note,) if result.ignored_bits else (),
-    )
-
-
-def identifiers(taken: Iterable[int]) -> tuple[int, ...]:
-    """Return the DSCP values that may become identifiers, those that mislead least first.
-
-    First pool 2, `xxxx11`, which RFC 2474 leaves to experimental and local use, then values without
-    a name, then named classes, and 0, which every unmarked packet carries, last.
-
-    Args:
-        taken: values that publishers have already.
-    """
-    named = {each.dscp for each in code_points()}
-    used = set(taken)
-    return tuple(
-        sorted(
-            (each for each in range(MAX_DSCP + 1) if each not in used),
-            key=lambda each: (each == 0, each in named, each & 0b11 != 0b11, each),
-        )
-    )
-
-
 class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint's need, resolved.
 
@@ -211,30 +112,25 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         need: as declared.
         topic: fully qualified name; empty if it cannot be resolved.
         unique: it must get an NFE of its own.
-        marking: DSCP, of a publisher's data or of a subscription's acknowledgements.
         flow_class: 5QI; publishers only.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
         transports: all that its participant may use; empty for any.
-        identified_by_receiver: every subscription of its topic asks for an NFE of its own, which
-            identifies the flow (weakly unique) whatever the publisher has.
     """
 
     need: FlowNeed
     topic: str
     unique: bool
-    marking: Marking
     flow_class: FlowClass
     max_delay_ms: float | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
-    identified_by_receiver: bool = False
 
     @property
     def dscp(self) -> int | None:
-        """The DSCP that its packets are to carry, 0–63."""
-        return self.marking.dscp
+        """The DSCP of its data, of a subscription of what it acknowledges with, 0–63."""
+        return self.need.dscp
 
     @property
     def five_qi(self) -> int | None:
@@ -257,7 +153,7 @@ class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
         five_qi: the class by which a network distinguishes it; None if it need not.
     """
 
-    kind: EndpointKind = EndpointKind.PUBLISHER
+    kind: EndpointKind
     names: tuple[str, ...]
     unique: bool
     dscp: int | None
@@ -272,7 +168,6 @@ class FlowNeeds:
 
     def __init__(self, manifest: Manifest) -> None:
         self._manifest = manifest
-        self._machines = {each.key: each.machine for each in manifest.nodes}
         self._delays: dict[tuple[str, str], float] = {}
         for link in manifest.links:
             if link.max_delay_ms is not None:
@@ -280,15 +175,11 @@ class FlowNeeds:
                 self._delays[place] = min(
                     link.max_delay_ms, self._delays.get(place, link.max_delay_ms)
                 )
-        self._identified_by_receiver = _identified_by_receiver(manifest)
-        resolved = {
+        self._resolved = {
             (node.key, need.kind, need.name): self._resolve(node, need)
             for node in manifest.nodes
             for need in node.flows
         }
-        if manifest.network.flow_identification is FlowIdentification.DSCP:
-            resolved = _with_identifiers(resolved, manifest)
-        self._resolved = {key: self._with_datagrams(key[0], each) for key, each in resolved.items()}
 
     def of(self, node_key: str, kind: EndpointKind, name: str) -> ResolvedNeed | None:
         """Return the need of an endpoint by its declared name; None if it has none."""
@@ -328,21 +219,18 @@ class FlowNeeds:
             each = self.of(node.key, endpoint.kind, endpoint.name)
             if each is None or not endpoint.kind.is_topic:
                 continue
-            if endpoint.kind is EndpointKind.SUBSCRIPTION:
-                if each.dscp is not None:
-                    _add_subscription(found, each, each.transports or own[2])
-                continue
-            five_qi = None if each.unique or each.identified_by_receiver else each.five_qi
-            transports = each.transports or own[2]
+            unique = each.unique and endpoint.kind is EndpointKind.PUBLISHER
+            five_qi, transports = None if each.unique else each.five_qi, each.transports or own[2]
             class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
-            if not each.unique and class_ == own and each.max_datagram_bytes is None:
+            if not unique and class_ == own and each.max_datagram_bytes is None:
                 continue
-            key = endpoint.name if each.unique else class_
+            key = endpoint.name if unique else (endpoint.kind, class_)
             known = found.get(key)
             sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
             found[key] = ParticipantGroup(
+                kind=endpoint.kind,
                 names=(*(known.names if known else ()), endpoint.name),
-                unique=each.unique,
+                unique=unique,
                 dscp=each.dscp,
                 five_qi=five_qi,
                 transports=transports,
@@ -355,16 +243,15 @@ class FlowNeeds:
         topic = topic_of(node, need.name, need.kind)
         delay = self._max_delay_ms(node, need, topic)
         flow_class = class_of(need, max_delay_ms=delay)
-        return ResolvedNeed(
+        resolved = ResolvedNeed(
             need=need,
             topic=topic,
             unique=need.unique.asks,
-            marking=marking_of(need, self._manifest.network, flow_class.five_qi),
             flow_class=flow_class,
             max_delay_ms=delay,
             transports=self._transports(node) if self._by_participant(need) else (),
-            identified_by_receiver=topic in self._identified_by_receiver,
         )
+        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(node, resolved))
 
     def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
         if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
@@ -386,85 +273,14 @@ class FlowNeeds:
     def _transports(self, node: Node) -> tuple[Medium, ...]:
         return (udp_to(self._manifest.address_of(node.machine)),)
 
-    def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
+    def _max_datagram_bytes(self, node: Node, each: ResolvedNeed) -> int | None:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
-            return each
+            return None
         declared = self._manifest.network.max_datagram_bytes
-        ipv6 = ":" in self._manifest.address_of(self._machines[node_key])
+        ipv6 = ":" in self._manifest.address_of(node.machine)
         limit = declared or max_unfragmented(ipv6=ipv6)
         size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)
-        if small:
-            return each
-        return replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
-
-
-def _add_subscription(
-    found: dict[object, ParticipantGroup], each: ResolvedNeed, transports: tuple[Medium, ...]
-) -> None:
-    key = (EndpointKind.SUBSCRIPTION, each.dscp, transports)
-    known = found.get(key)
-    found[key] = ParticipantGroup(
-        kind=EndpointKind.SUBSCRIPTION,
-        names=(*(known.names if known else ()), each.need.name),
-        unique=False,
-        dscp=each.dscp,
-        five_qi=None,
-        transports=transports,
-        max_datagram_bytes=None,
-        non_blocking_send=False,
-    )
-
-
-def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
-    """Topics whose every subscription gets an NFE of its own."""
-    answers: dict[str, bool] = {}
-    for node in manifest.nodes:
-        needs = {need.name: need for need in node.flows if need.kind is EndpointKind.SUBSCRIPTION}
-        for endpoint in node.interface.endpoints:
-            if endpoint.kind is not EndpointKind.SUBSCRIPTION:
-                continue
-            topic = topic_of(node, endpoint.name, endpoint.kind)
-            need = needs.get(endpoint.name)
-            own = need is not None and need.unique.asks and node.run.kind is RunKind.PYTHON
-            answers[topic] = answers.get(topic, True) and own
-    return frozenset(topic for topic, every in answers.items() if every)
-
-
-_Key = tuple[str, EndpointKind, str]
-
-
-def _with_identifiers(
-    resolved: dict[_Key, ResolvedNeed], manifest: Manifest
-) -> dict[_Key, ResolvedNeed]:
-    """Give each publisher that needs a unique flow a DSCP of its own (*Unique Network Flows*).
-
-    A DSCP that is written stays. The others get unused values, over all nodes, in the order of the
-    manifest; when the 64 are used up, the rest have a problem instead.
-    """
-    asking = [
-        key
-        for key, each in resolved.items()
-        if each.unique and each.need.kind is EndpointKind.PUBLISHER
-    ]
-    free = iter(identifiers(each.dscp for each in resolved.values() if each.dscp is not None))
-    nodes = {node.key: node for node in manifest.nodes}
-    found = dict(resolved)
-    for number, key in enumerate(asking, start=1):
-        each = resolved[key]
-        if each.dscp is not None or nodes[key[0]].run.kind is not RunKind.PYTHON:
-            continue
-        dscp = next(free, None)
-        if dscp is None:
-            message = (
-                f"cannot give publisher {key[2]!r} of {key[0]!r} a DSCP of its own: it is number "
-                f"{number} of {len(asking)} publishers that need one, and a DSCP has 64 values"
-            )
-            hint = "use 'flow_identification: participant', or ask for fewer unique publishers"
-            marking = Marking(problem=(message, hint))
-        else:
-            marking = Marking(dscp=dscp, reason="its identifier")
-        found[key] = replace(each, marking=marking)
-    return found
+        return None if small else declared or SAFE_DATAGRAM_BYTES

@@ -26,7 +26,6 @@ from lifecycle.manifest.qos import (
     History,
     QosProfile,
     not_written,
-    problems,
 )
 from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.document import Document, error, note
@@ -97,8 +96,9 @@ def _qos(part: Document | None, default: QosProfile, found: Findings) -> QosProf
     if plain["history"] == History.KEEP_ALL.value:
         plain["depth"] = 0  # rmw ignores it there
     profile = msgspec.convert(plain, QosProfile, strict=False)
-    at = part.at(("depth",))
-    found.extend(error("manifest.qos", at, f"cannot {each}") for each in problems(profile))
+    if profile.history is History.KEEP_LAST and profile.depth == 0:
+        message = "cannot use depth 0 with KEEP_LAST: it would keep nothing; set depth >= 1"
+        found.append(error("manifest.qos", part.at(("depth",)), message))
     return profile
 
 

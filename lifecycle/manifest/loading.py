@@ -19,9 +19,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.building import (
-    build_data_layer,
     build_modes,
-    build_network,
     build_node,
     build_on_violation,
     positions_of,
@@ -36,12 +34,14 @@ from lifecycle.manifest.diagnostics import (
     in_order,
 )
 from lifecycle.manifest.model import (
+    DataLayer,
     Discovery,
     EndpointKind,
     Link,
     LinkKeys,
     Machine,
     Manifest,
+    Network,
     Node,
     Policy,
 )
@@ -95,9 +95,8 @@ def load(
         ManifestError: with every error and warning, sorted by position.
     """
     variables = os.environ if environment is None else environment
-    origin = include.Origin.of(Path(path))
     loading = _Loading(variables, Programs(variables) if run_commands else None)
-    loading.read(origin, arguments)
+    loading.read(Path(path), arguments)
     manifest, found = loading.manifest(), loading.found
 
     def every() -> tuple[Diagnostic, ...]:
@@ -212,7 +211,7 @@ class _Reading(msgspec.Struct, frozen=True, kw_only=True):
         left_out: places that conditions leave out.
     """
 
-    chain: tuple[include.Origin, ...]
+    chain: tuple[Path, ...]
     left_out: tuple[Place, ...]
 
 
@@ -251,31 +250,31 @@ class _Loading:
 
     def read(
         self,
-        origin: include.Origin,
+        path: Path,
         given: Mapping[str, str],
         *,
-        chain: tuple[include.Origin, ...] = (),
+        chain: tuple[Path, ...] = (),
         entry: Document | None = None,
         around: Shared = NOTHING,
     ) -> None:
         """Read one manifest and what it includes.
 
         Args:
-            origin: the file.
+            path: the file.
             given: argument values.
             chain: the manifests that include it, outermost first.
             entry: the include that names it; None for the outermost.
             around: what the including manifests and groups give its nodes.
         """
-        self.files.append(origin.shown)
+        self.files.append(include.shown(path))
         try:
-            document = read_document(origin.path, shown=origin.shown)
+            document = read_document(path, shown=self.files[-1])
         except ManifestError as problem:
             self.found += problem.diagnostics
             return
         self._check_suffix(document)
         before = len(self.found)
-        substituted = self._substituted(document, origin, given, entry)
+        substituted = self._substituted(document, path, given, entry)
         document = substituted.document
         emptied = [
             place[:-1]
@@ -286,28 +285,25 @@ class _Loading:
         self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return
-        self._system(document, origin, substituted.arguments)
+        self._system(document, substituted.arguments)
         for name, each in document.entries("machines"):
             self._machine(name, each)
         first_link = len(self._links)
-        reading = _Reading(chain=(*chain, origin), left_out=substituted.left_out)
+        reading = _Reading(chain=(*chain, path), left_out=substituted.left_out)
         self._contents(reading, document, around, entry)
         links = [self._link(each, around) for each in document.items("links")]
         self._links[first_link:first_link] = links
 
-    def _system(
-        self, document: Document, origin: include.Origin, arguments: tuple[tuple[str, str], ...]
-    ) -> None:
+    def _system(self, document: Document, arguments: tuple[tuple[str, str], ...]) -> None:
         """Build what is declared of the whole system: the outermost manifest's holds."""
-        base = origin.path.parent
         declared = Manifest(
-            path=origin.shown,
+            path=document.file,
             arguments=arguments,
             system=document.text("system"),
             description=document.text("description"),
             discovery=read_part(document, Discovery, ("discovery",)),
-            network=build_network(document, base=base, found=self.found),
-            data_layer=build_data_layer(document, self.found),
+            network=read_part(document, Network, ("network",)),
+            data_layer=read_part(document, DataLayer, ("data_layer",)),
             policy=read_part(document, Policy, ("policy",)),
             on_violation=build_on_violation(document),
             modes=build_modes(document, self.found),
@@ -329,19 +325,17 @@ class _Loading:
     def _substituted(
         self,
         document: Document,
-        origin: include.Origin,
+        path: Path,
         given: Mapping[str, str],
         entry: Document | None,
     ) -> Substituted:
         surroundings = Surroundings(
             environment=self._environment,
-            folder=folder_of(origin.path),
+            folder=folder_of(path),
             programs=self._programs,
         )
         found = substitute(document, given, surroundings, include=entry)
         self.found += found.diagnostics
-        for place in found.left_out:
-            self.found += _misspelt(document, place)
         return found
 
     def _contents(
@@ -360,7 +354,7 @@ class _Loading:
             node = build_node(
                 key,
                 part,
-                base=reading.chain[-1].path.parent,
+                base=reading.chain[-1].parent,
                 shared=shared,
                 environment=self._environment,
                 found=self.found,
@@ -408,8 +402,8 @@ class _Loading:
             )
 
     def _include(self, reading: _Reading, entry: Document, shared: Shared) -> None:
-        origin = include.locate(entry, reading.chain, self.found)
-        if origin is None:
+        path = include.locate(entry, reading.chain, self.found)
+        if path is None:
             return
         self._documents += 1
         if self._documents > include.MAX_DOCUMENTS:
@@ -419,7 +413,7 @@ class _Loading:
             return
         given = {name: each.root.text for name, each in entry.entries("arguments")}
         inner = shared.inner(entry, self.found)
-        self.read(origin, given, chain=reading.chain, entry=entry, around=inner)
+        self.read(path, given, chain=reading.chain, entry=entry, around=inner)
 
     def _link(self, part: Document, around: Shared) -> Link:
         """Build a link of a document; its topic moves with the document's namespace."""
@@ -463,15 +457,6 @@ class _Loading:
             stem = name.removesuffix(".yaml").removesuffix(".yml")
             hint = f"rename it to {stem}{SUFFIX}"
             self.found.append(note("manifest.suffix", at, message, hint))
-
-
-def _misspelt(document: Document, place: Place) -> tuple[Diagnostic, ...]:
-    """Return what is wrong with something that is left out, whatever its substitutions become."""
-    part = document.get(*place)
-    if part is None:
-        return ()
-    kind = str(place[-2]).removesuffix("s").capitalize()
-    return validate(part, definition=kind, is_resolved=False)
 
 
 def _keys_of(group: Value) -> Iterator[str]:

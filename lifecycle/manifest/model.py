@@ -18,8 +18,6 @@ from lifecycle.codec import says
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.network.five_qi import DscpMapping
 from lifecycle.network.medium import FlowTransport as FlowTransport  # noqa: PLC0414
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -210,13 +208,6 @@ class UniqueHow(enum.Enum):
     STRONGLY = "strongly"
 
 
-class FlowIdentification(enum.Enum):
-    """How publishers that need a unique flow get one (*Unique Network Flows*)."""
-
-    PARTICIPANT = "participant"  # sockets of their own: unique transport ports
-    DSCP = "dscp"  # a DSCP of their own as the sixth element of the tuple; at most 64
-
-
 def spelled(pattern: str, message: str) -> Meta:
     """Return the pattern of a string, with what is said of one that does not match."""
     return Meta(pattern=pattern, extra_json_schema={"patternErrorMessage": message})
@@ -228,11 +219,18 @@ Text = Annotated[str, Meta(min_length=1)]
 NodeKey = Annotated[
     str, spelled(rf"^{WORD}(/{WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
 ]
+_OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])"
+IPv4Group = Annotated[
+    str,
+    spelled(
+        rf"^(22[4-9]|23[0-9])(\.{_OCTET}){{3}}\Z",
+        "write an IPv4 group; 239.255.* stay within an organisation (RFC 2365)",
+    ),
+]
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
 Hertz = Annotated[float, Meta(gt=0, le=1_000_000)]
-UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 """A ROS parameter value; arrays are tuples of one scalar type."""
@@ -669,9 +667,6 @@ class SubscriptionFlow(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_f
         dscp: Differentiated services code point of everything it sends, which is its
             acknowledgements: the data carry the publisher's. A name (RFC 2474, 2597, 3246, …) or 0
             to 63.
-        transport_priority: DDS TRANSPORT_PRIORITY of the DataReader, instead of 'dscp': goes
-            through 'network.transport_priority_mapping' to become a TOS byte, which is four times
-            the DSCP. Without a mapping it is the TOS byte.
         enforce: Whether a DSCP that could not be applied is violated (true) or a warning (false).
         transport: What carries it: what the planner chooses (any), an IP socket (network), shared
             memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
@@ -681,7 +676,6 @@ class SubscriptionFlow(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_f
 
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
     dscp: Dscp | None = None
-    transport_priority: Annotated[UInt32, Meta(examples=[184])] | None = None
     enforce: bool = True
     transport: FlowTransport = FlowTransport.ANY
     lossy: bool | None = None
@@ -693,9 +687,6 @@ class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
     Attributes:
         dscp: Differentiated services code point of everything it sends: a name (RFC 2474, 2597,
             3246, …) or 0 to 63.
-        transport_priority: DDS TRANSPORT_PRIORITY, instead of 'dscp': goes through
-            'network.transport_priority_mapping' to become a TOS byte, which is four times the DSCP.
-            Without a mapping it is the TOS byte.
         five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
             'max_delay_ms', 'loss' and 'rate_hz' and says why.
         max_delay_ms: Longest delay from publication to the start of the callback, milliseconds;
@@ -716,8 +707,7 @@ class FlowNeed(PublisherFlow, frozen=True, kw_only=True):
     Attributes:
         kind: PUBLISHER or SUBSCRIPTION.
         name: the endpoint's declared name.
-        dscp: 0–63, of all that the endpoint sends; None leaves it alone. Never beside
-            `transport_priority`.
+        dscp: 0–63, of all that the endpoint sends; None leaves it alone.
         five_qi: None if not asked for, or left to us.
         five_qi_auto: `five_qi: auto`: the planner proposes one.
         rate_hz: messages per second that a network must carry: the upper bound where it has one.
@@ -913,34 +903,18 @@ class DataLayer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     authority: Authority = Authority.NODES
     source: DataLayerSource = DataLayerSource.STATIC
     events: bool = False
-    multicast_group: Text = "239.255.1.1"
+    multicast_group: IPv4Group = "239.255.1.1"
 
 
-class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How flow needs become network resources.
 
     Attributes:
-        flow_identification: How publishers that need a unique flow get one: sockets of their own
-            (participant), or a DSCP of their own as a sixth element of the tuple (dscp; at most 64,
-            and no router may read them as classes).
-        five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
-            of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
         max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
             with IPv4 if left out.
     """
 
-    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
-    transport_priority_mapping: TransportPriorityMapping | None = None
-    five_qi_dscp: (
-        Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
-    ) = None
     max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
-
-
-class Network(NetworkKeys, frozen=True, kw_only=True):
-    """How flow needs become network resources, with the mapping that is named."""
-
-    five_qi_dscp: DscpMapping | None = None  # type: ignore[assignment]
 
 
 TOLERATED_NODES = (

@@ -43,8 +43,8 @@ def remap_kind(kind: EndpointKind) -> RemapKind:
     return RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
 
 
-class RemapRuleError(LifecycleError):
-    """A remap rule that rcl refuses; a process that is given one does not start."""
+class NameNotLegalError(LifecycleError):
+    """A name that no ROS node can use, or a remap rule that rcl refuses."""
 
     exit_code = ExitCode.MANIFEST_INVALID
 
@@ -73,7 +73,7 @@ def parse_rule(match: str, replacement: str) -> RemapRule:
     """Read the two sides of `match:=replacement`.
 
     Raises:
-        RemapRuleError: rcl would refuse it.
+        NameNotLegalError: rcl would refuse it.
     """
     node, rest = "", match
     if prefix := _NODE_PREFIX.fullmatch(match):
@@ -89,7 +89,7 @@ def parse_rule(match: str, replacement: str) -> RemapRule:
         if rest.startswith(scheme):
             kind, rest = only, rest[len(scheme) :]
     if "*" in rest:
-        raise RemapRuleError(f"cannot remap {match!r}: rcl has no wildcards in remap rules")
+        raise NameNotLegalError(f"cannot remap {match!r}: rcl has no wildcards in remap rules")
     _require(_NAME, rest, "a name, as in 'scan', '~/scan' or '/robot/scan'")
     _require(_NAME, replacement, "a name, as in 'scan', '~/scan' or '/robot/scan'")
     return RemapRule(kind=kind, node=node, match=rest, replacement=replacement)
@@ -99,7 +99,7 @@ def _require(pattern: re.Pattern[str], text: str, what: str) -> None:
     if pattern.fullmatch(text):
         return
     why = "rcl allows no '__' there" if "__" in text else f"it must be {what}"
-    raise RemapRuleError(f"cannot use {text!r} in a remap rule: {why}")
+    raise NameNotLegalError(f"cannot use {text!r} in a remap rule: {why}")
 
 
 MAX_TOPIC_LENGTH = 247
@@ -120,12 +120,6 @@ ACTION_TOPICS = ("feedback", "status")
 _NOT_IN = {"": re.compile(r"[^A-Za-z0-9_]"), "/": re.compile(r"[^A-Za-z0-9_/]")}
 _SUBSTITUTION = re.compile(r"\{([^{}]*)\}")
 _KNOWN_SUBSTITUTIONS = ("node", "ns", "namespace")
-
-
-class NameNotLegalError(LifecycleError):
-    """A name that no ROS node can use."""
-
-    exit_code = ExitCode.MANIFEST_INVALID
 
 
 def node_name_problem(name: str) -> str:

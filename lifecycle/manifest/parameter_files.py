@@ -148,16 +148,22 @@ class Section(msgspec.Struct, frozen=True, kw_only=True):
         return len(parts) in reached
 
 
-def read_sections(path: str, *, shown: str) -> tuple[tuple[Section, ...], tuple[Diagnostic, ...]]:
-    """Read a parameter file.
+class ParameterFile(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a parameter file.
 
-    Args:
-        path: the file, which exists.
+    Attributes:
         shown: how messages name it.
-
-    Returns:
-        Sections in the file's order, each name once, and what is wrong with the file.
+        sections: in the file's order, each name once; none where it cannot be read.
+        flaws: what is wrong with it.
     """
+
+    shown: str
+    sections: tuple[Section, ...] = ()
+    flaws: tuple[Diagnostic, ...] = ()
+
+
+def read_parameter_file(path: str, *, shown: str) -> ParameterFile:
+    """Read a parameter file, which exists; messages name it as `shown`."""
     reader = _Reader(shown)
     try:
         text = decode(read_bytes(path, file=shown), file=shown)
@@ -168,8 +174,10 @@ def read_sections(path: str, *, shown: str) -> tuple[tuple[Section, ...], tuple[
             msgspec.structs.replace(each, message=each.message.replace("a manifest", "text"))
             for each in problem.diagnostics
         )
-        return (), (*reader.found, *said)
-    return ((), tuple(reader.found)) if reader.found else (tuple(reader.sections()), ())
+        return ParameterFile(shown=shown, flaws=(*reader.found, *said))
+    if reader.found:
+        return ParameterFile(shown=shown, flaws=tuple(reader.found))
+    return ParameterFile(shown=shown, sections=tuple(reader.sections()))
 
 
 class _Name(msgspec.Struct):
@@ -409,20 +417,6 @@ def _name_problem(name: str) -> str:
     return "" if base in _WILDCARDS else node_name_problem(base)
 
 
-class ParameterFile(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of a parameter file.
-
-    Attributes:
-        shown: how messages name it.
-        sections: in the file's order; none where it cannot be read.
-        flaws: what is wrong with it.
-    """
-
-    shown: str
-    sections: tuple[Section, ...]
-    flaws: tuple[Diagnostic, ...]
-
-
 class ParameterFiles:
     """The parameter files of one system, each read once.
 
@@ -439,6 +433,5 @@ class ParameterFiles:
         if path not in self._files:
             # relpath, not relative_to: a file may well lie beside the manifest's folder.
             shown = os.path.normpath(self._folder / os.path.relpath(path, self._folder))
-            sections, flaws = read_sections(path, shown=shown)
-            self._files[path] = ParameterFile(shown=shown, sections=sections, flaws=flaws)
+            self._files[path] = read_parameter_file(path, shown=shown)
         return self._files[path]

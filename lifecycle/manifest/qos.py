@@ -215,23 +215,6 @@ def incompatibilities(offered: QosProfile, requested: QosProfile) -> tuple[Incom
     return tuple(each for each in found if each is not None)
 
 
-def problems(profile: QosProfile) -> tuple[str, ...]:
-    """Return what no rmw can do with `profile`; each a phrase to put after "cannot ".
-
-    Rules of rmw/types.h: a duration is 0 to 2**63-1 ns, KEEP_LAST keeps at least one message.
-    """
-    found = []
-    if profile.depth < 0:
-        found.append(f"use depth {profile.depth}: depth counts messages, 0 or more")
-    elif profile.history is History.KEEP_LAST and profile.depth == 0:
-        found.append("use depth 0 with KEEP_LAST: it would keep nothing; set depth >= 1")
-    for name in ("deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"):
-        value = getattr(profile, name)
-        if value is not None and not 0 <= value <= INFINITE_NS:
-            found.append(f"use {name} {value}: a duration is 0 to 2**63-1 nanoseconds")
-    return tuple(found)
-
-
 _RELIABILITY_OFFERS = {Reliability.BEST_AVAILABLE: Reliability.RELIABLE}
 _DURABILITY_OFFERS = {Durability.BEST_AVAILABLE: Durability.TRANSIENT_LOCAL}
 # rmw_dds_common gives a BEST_AVAILABLE publisher the stronger value whatever it has discovered;

@@ -57,7 +57,6 @@ def validate(
     *,
     definition: str = "",
     ignore: Collection[Place] = (),
-    is_resolved: bool = True,
 ) -> tuple[Diagnostic, ...]:
     """Check a document.
 
@@ -65,15 +64,14 @@ def validate(
         document: what to check.
         definition: name of a type in `written`, for a part of a manifest; the whole if empty.
         ignore: values already reported; nothing is reported about them or anything inside.
-        is_resolved: its substitutions are; of one that is left out they never will be.
 
     Returns:
         Every violation, at most `MAX_FINDINGS`, in no particular order.
     """
     type_ = getattr(written, definition or "Manifest")
-    if is_resolved and not ignore and _fits(document, type_):
+    if not ignore and _fits(document, type_):
         return ()
-    errors = list(_meant(validator(definition, is_resolved).iter_errors(document.plain())))
+    errors = list(_meant(validator(definition).iter_errors(document.plain())))
     enums = {_place(each) for each in errors if each.validator == "enum"}
     found: dict[Diagnostic, None] = {}
     for each in errors:
@@ -105,21 +103,15 @@ def _fits(document: Document, type_: type) -> bool:
 
 
 @functools.cache
-def validator(definition: str, is_resolved: bool) -> Draft202012Validator:
-    """Return what asks jsonschema about a part of a manifest; the arguments are `validate`'s."""
+def validator(definition: str = "") -> Draft202012Validator:
+    """Return what asks jsonschema about a part of a manifest; `definition` as in `validate`."""
     from jsonschema import Draft202012Validator
 
-    return Draft202012Validator(_schema(definition, is_resolved))
-
-
-@functools.cache
-def _schema(definition: str, is_resolved: bool) -> Mapping[str, Any]:
-    whole = read_schema(MANIFEST)
-    schema = _resolved_only(whole) if is_resolved else whole
+    schema = _resolved_only(read_schema(MANIFEST))
     assert isinstance(schema, dict)
     if definition:
         schema = {"$defs": schema["$defs"], "$ref": f"#/$defs/{definition}"}
-    return schema
+    return Draft202012Validator(schema)
 
 
 def _resolved_only(schema: object) -> object:
@@ -208,15 +200,6 @@ def _diagnose(document: Document, each: ValidationError) -> Iterator[tuple[Place
 
 _RULES = {"type": "type", "oneOf": "choice", "anyOf": "choice", "pattern": "pattern"}
 
-_GONE = {
-    "on_supervisor_lost": (
-        "nodes whose supervisor is gone are deactivated, and their process ends",
-        "remove it",
-    ),
-    "on_violation": ("a link has none", "write it at one of its nodes, or for the system"),
-}
-"""Keys of earlier versions: what holds without them, and what to do."""
-
 
 def _known(each: ValidationError) -> Mapping[str, Any]:
     """Return the keys that the mapping of an error may have, and their schemas."""
@@ -230,10 +213,7 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
         if key in known:
             continue
         message, hint = f"cannot use the unknown key {quote(key)}", did_you_mean(key, known)
-        if key in _GONE:
-            why, hint = _GONE[key]
-            message = f"cannot use {quote(key)} any more: {why}"
-        elif not hint:
+        if not hint:
             message = f"{message}; allowed: {', '.join(known)}"
         place = (*_place(each), key)
         yield place, error("manifest.unknown-key", document.key_at(place), message, hint)

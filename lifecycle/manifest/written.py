@@ -20,8 +20,9 @@ from lifecycle.manifest.model import (
     Dscp,
     EndpointPolicy,
     Executor,
+    Health,
     LinkKeys,
-    NetworkKeys,
+    Network,
     NodeKey,
     Policy,
     ProcessKeys,
@@ -36,7 +37,6 @@ from lifecycle.manifest.model import (
     require,
     spelled,
 )
-from lifecycle.manifest.model import Health as NodeHealth
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
@@ -230,8 +230,7 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
             others start.
         extra_arguments: Extra arguments of the request that loads 'component' (LoadNode.srv), as
             'use_intra_process_comms' of rclcpp_components.
-        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf;
-            one text is split as a shell does.
+        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf.
         resources: What the process and all that it starts may use together, as
             systemd.resource-control(5); set by systemd where that runs, else unverifiable.
     """
@@ -299,8 +298,8 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
     extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
     prefix: (
         Annotated[
-            Text | Annotated[tuple[Scalar, ...], Meta(min_length=1)],
-            Meta(examples=[["gdb", "-ex", "run", "--args"], "nice -n 5"]),
+            tuple[Scalar, ...],
+            Meta(min_length=1, examples=[["gdb", "-ex", "run", "--args"], ["nice", "-n", 5]]),
         ]
         | None
     ) = None
@@ -311,70 +310,67 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
         require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
-class TopicEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One publisher or subscription.
+def _interface_type(kind: str, example: str) -> Meta:
+    message = f"write package/{kind}/Type, as in {example}"
+    return Meta(
+        pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
+        examples=[example],
+        extra_json_schema={"patternErrorMessage": message},
+    )
+
+
+class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One endpoint.
 
     Attributes:
         name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
             remapping.
-        type: ROS type, package/msg/Type.
         description: What it is for; for people.
-        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
-            make the endpoint with; nothing requires them.
     """
 
     name: Text
-    type: Annotated[
-        str,
-        spelled(rf"^{_TYPE}/msg/{_TYPE}\Z", "write package/msg/Type, as in sensor_msgs/msg/Image"),
-        Meta(examples=["sensor_msgs/msg/Image"]),
-    ]
     description: str = ""
-    qos: Preset | Qos | None = None
 
 
-class ServiceEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One server or client of a service.
-
-    Attributes:
-        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
-            remapping.
-        type: ROS type, package/srv/Type.
-        description: What it is for; for people.
-        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
-            make the endpoint with; nothing requires them.
-    """
-
-    name: Text
-    type: Annotated[
-        str,
-        spelled(rf"^{_TYPE}/srv/{_TYPE}\Z", "write package/srv/Type, as in std_srvs/srv/Trigger"),
-        Meta(examples=["std_srvs/srv/Trigger"]),
-    ]
-    description: str = ""
-    qos: Preset | Qos | None = None
-
-
-class ActionEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
     """One server or client of an action.
 
     Attributes:
-        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
-            remapping.
         type: ROS type, package/action/Type.
-        description: What it is for; for people.
     """
 
-    name: Text
-    type: Annotated[
-        str,
-        spelled(
-            rf"^{_TYPE}/action/{_TYPE}\Z",
-            "write package/action/Type, as in example_interfaces/action/Fibonacci",
-        ),
-        Meta(examples=["example_interfaces/action/Fibonacci"]),
-    ]
-    description: str = ""
+    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
+
+
+class QosEndpoint(Endpoint, frozen=True, kw_only=True):
+    """One endpoint of a topic or service.
+
+    Attributes:
+        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
+            make the endpoint with; nothing requires them.
+    """
+
+    qos: Preset | Qos | None = None
+
+
+class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
+    """One server or client of a service.
+
+    Attributes:
+        type: ROS type, package/srv/Type.
+    """
+
+    type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
+
+
+class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
+    """One publisher or subscription.
+
+    Attributes:
+        type: ROS type, package/msg/Type.
+    """
+
+    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
 
 Preset = Literal[
@@ -487,19 +483,6 @@ InterfaceReference = Annotated[
         examples=["local://camera.nodl.yaml"],
     ),
 ]
-
-
-class Health(NodeHealth, frozen=True, kw_only=True):
-    """What shows whether the node is healthy, which it then must be (rule node.unhealthy)."""
-
-    ANY_OF: ClassVar[Ways] = (("check",), ("diagnostics",))
-
-    check: bool | None = None  # type: ignore[assignment]
-    diagnostics: Text | Annotated[tuple[Text, ...], Meta(min_length=1)] | None = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        """Raise ValueError unless something shows it."""
-        require(_written(self, self.ANY_OF) > 0)
 
 
 Level = Literal["started", "configured", "connected", "active", "healthy"]
@@ -752,7 +735,7 @@ class Manifest(Shared, frozen=True, kw_only=True):
     arguments: dict[Name, Argument] = field(default_factory=dict)
     machines: dict[Name, Machine] = field(default_factory=dict)
     discovery: Discovery = Discovery()
-    network: NetworkKeys = NetworkKeys()
+    network: Network = Network()
     data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
     on_violation: OnViolation | None = None

@@ -507,15 +507,11 @@ def _planned_endpoint(
     )
     if need is None:
         return planned
-    message, hint = need.marking.problem
-    if message:
-        raise PlanError(message, hint=hint, at=need.need.at)
     return replace(
         planned,
         **{name: getattr(need.need, name) for name in _ASKED},
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
-        dscp_reason=need.marking.reason,
         five_qi=need.five_qi,
         five_qi_reason=need.flow_class.reason,
         max_delay_ms=need.max_delay_ms,

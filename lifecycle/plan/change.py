@@ -20,7 +20,7 @@ from lifecycle.plan.model import ExpectedParameter, Plan, PlannedEndpoint, Plann
 from lifecycle.plan.parameters import COMMAND
 
 _JUDGED_BY = (
-    *("enforce_dscp", "dscp_reason", "five_qi", "five_qi_reason", "max_delay_ms", "quantities"),
+    *("enforce_dscp", "five_qi", "five_qi_reason", "max_delay_ms", "quantities"),
     *("measure", "type_hash", "qos_defaults"),
 )
 """Fields of an endpoint that its process does not know: they are for the verdict and networks."""

@@ -145,7 +145,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
         quantities: each of its numbers that only a measurement could prove, as it is written.
         measure: a subscription of ours measures them where nothing else does.
         dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
-        dscp_reason: source of a DSCP that is not written as such; empty if it is.
         five_qi_reason: why it is this 5QI, or none, where the manifest has `auto`; else empty.
         participant: base name of the PlannedParticipant that carries it; empty for the node's own.
         max_delay_ms: declared bound, or the shortest of the links on its topic; None without.
@@ -162,7 +161,6 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
     measure: bool = False
     dscp: DscpValue | None = None
     enforce_dscp: bool = True
-    dscp_reason: str = ""
     five_qi: int | None = None
     five_qi_reason: str = ""
     participant: str = ""

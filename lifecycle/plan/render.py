@@ -205,9 +205,8 @@ def _endpoint_facts(endpoint: PlannedEndpoint) -> str:
     if endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
         facts.append(f"unique {endpoint.unique.value}")
     if endpoint.dscp is not None:
-        why = f", {endpoint.dscp_reason}" if endpoint.dscp_reason else ""
         kept = "" if endpoint.enforce_dscp else ", not enforced"
-        facts.append(f"{describe(endpoint.dscp)}{why}{kept}")
+        facts.append(f"{describe(endpoint.dscp)}{kept}")
     if endpoint.five_qi is not None:
         facts.append(endpoint.five_qi_reason or f"5QI {endpoint.five_qi}")
     if endpoint.transport is FlowTransport.NETWORK:

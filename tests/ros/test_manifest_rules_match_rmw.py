@@ -21,7 +21,6 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
-    RemapRuleError,
     expand,
     full_name_problem,
     name_problem,
@@ -30,7 +29,7 @@ from lifecycle.manifest.names import (
     parse_rule,
     resolve,
 )
-from lifecycle.manifest.parameter_files import read_sections, type_of
+from lifecycle.manifest.parameter_files import read_parameter_file, type_of
 from lifecycle.manifest.qos import (
     INFINITE_NS,
     PRESETS,
@@ -263,7 +262,7 @@ def test_a_rule_is_legal_exactly_when_rcl_reads_it(rule: str) -> None:
     try:
         context.init(args=["--ros-args", "-r", rule])
     except rcl.RCLError:
-        with pytest.raises(RemapRuleError):
+        with pytest.raises(NameNotLegalError):
             parse_rule(match, replacement)
     else:
         context.shutdown()
@@ -310,17 +309,17 @@ def test_a_parameter_file_means_what_rclpy_reads_from_it(tmp_path: Path, domain_
     node.destroy_node()
     context.shutdown()
     words = {"int": "INTEGER"}
-    sections, found = read_sections(str(path), shown="p.yaml")
+    file = read_parameter_file(str(path), shown="p.yaml")
     ours = {
         name: (
             "_".join(words.get(word, word.upper()) for word in type_of(value).split("_")),
             list(value) if isinstance(value, tuple) else value,
         )
-        for section in sections
+        for section in file.sections
         if section.matches("/robot/camera")
         for name, value, _ in section.parameters
     }
-    assert found == ()
+    assert file.flaws == ()
     assert str(sorted(ours.items())) == str(
         sorted(item for item in real.items() if item[0] in ours)
     )

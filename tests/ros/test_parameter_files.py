@@ -23,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.impl.implementation_singleton import rclpy_implementation  # loads the library
 
-from lifecycle.manifest.parameter_files import read_sections
+from lifecycle.manifest.parameter_files import read_parameter_file
 
 assert rclpy_implementation
 
@@ -126,12 +126,12 @@ def _values(node: _Node) -> Iterator[tuple[str, Any]]:
 
 def _ours(path: Path) -> Read | None:
     """Return sections as this package reads them; `[]`, from which rcl takes nothing, left out."""
-    sections, found = read_sections(str(path), shown="f")
-    if found:
+    file = read_parameter_file(str(path), shown="f")
+    if file.flaws:
         return None
     return [
         (each.pattern, {name: value for name, value, _ in each.parameters if value != ()})
-        for each in sections
+        for each in file.sections
     ]
 
 

@@ -1,12 +1,7 @@
-"""Checks of connection URLs: conflicting ports, addresses of the machine, peers, combined URLs.
-
-Owns: check.connection-ports, check.connection-address, check.connection-peer,
-check.connection-urls. Pure.
-"""
+"""Checks of connection URLs: conflicting ports, combined URLs. Pure."""
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterator
 
 import msgspec
@@ -16,12 +11,11 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DiscoveryMode,
-    EndpointKind,
     Node,
 )
-from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
-from lifecycle.network.nfe import is_loopback, may_be_same
+from lifecycle.manifest.yaml.document import error
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, check_together
+from lifecycle.network.nfe import may_be_same
 from lifecycle.network.ports import DG, domain_base, owner_of
 
 _WORDS = {
@@ -45,96 +39,38 @@ class _Use(msgspec.Struct, frozen=True, kw_only=True):
 
 def check_urls(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the URLs of every declared connection."""
-    uses: list[_Use] = []
-    contacts: set[tuple[str, int]] = set()
-    for node, connection, url, at in _urls(system):
-        uses += _uses(system, node, connection, url, at)
-        contacts |= _contacts(system, node, url)
-        yield from _own_address(system, node, url, at)
+    uses = list(_uses(system))
     yield from _collisions(uses)
     yield from _well_known(system, uses)
-    for node, connection, url, at in _urls(system):
-        yield from _peers(system, url, at, contacts)
-        yield from _loopback(system, node, connection, url, at)
     for node in system.manifest.nodes:
         for connection in node.connections:
             yield from _together(node, connection)
 
 
-def _urls(
-    system: DeclaredSystem,
-) -> Iterator[tuple[Node, ConnectionDeclaration, ConnectionUrl, Position]]:
+def _uses(system: DeclaredSystem) -> Iterator[_Use]:
     for node in system.manifest.nodes:
         for connection in node.connections:
             for index, url in enumerate(connection.urls):
-                yield (
-                    node,
-                    connection,
-                    url,
-                    node.where(f"connections.{connection.name}.urls.{index}"),
-                )
+                at = node.where(f"connections.{connection.name}.urls.{index}")
+                host = system.manifest.address_of(node.machine)
+                what = f"of connection {connection.name!r} of {node.key!r}"
+                yield from _ports(url, host, what, at)
 
 
-def _uses(
-    system: DeclaredSystem,
-    node: Node,
-    connection: ConnectionDeclaration,
-    url: ConnectionUrl,
-    at: Position,
-) -> Iterator[_Use]:
+def _ports(url: ConnectionUrl, host: str, what: str, at: Position) -> Iterator[_Use]:
+    group = url.transport.is_group
     for attribute, word in _WORDS.items():
         port = getattr(url, attribute)
-        if port is None:
-            continue
-        group = url.transport.is_group
-        yield _Use(
-            host=system.manifest.address_of(node.machine),
-            tcp=url.transport.is_tcp,
-            group=group and attribute == "port",
-            address="" if group or attribute == "output_port" else url.address,
-            port=port,
-            what=f"{word} of connection {connection.name!r} of {node.key!r}",
-            at=at,
-        )
-
-
-def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tuple[str, int]]:
-    """Return where a connection's discovery is reached, by every address of its host."""
-    tcp = url.transport.is_tcp
-    port = url.port if tcp else url.metatraffic_port
-    if port is None:
-        return set()
-    own = "" if url.transport.is_group else url.address
-    addresses = (
-        {own}
-        if own and not ipaddress.ip_address(own).is_unspecified
-        else {
-            system.manifest.address_of(node.machine),
-            "127.0.0.1",
-            "::1",
-            *url.interfaces,
-        }
-    )
-    return {(address, port) for address in addresses}
-
-
-def _own_address(
-    system: DeclaredSystem, node: Node, url: ConnectionUrl, at: Position
-) -> Iterator[Diagnostic]:
-    host = system.manifest.address_of(node.machine)
-    if not host or not url.address or url.transport.is_group:
-        return
-    own = ipaddress.ip_address(url.address)
-    if own.is_loopback or own.is_unspecified or own == ipaddress.ip_address(host):
-        return
-    if own.version != ipaddress.ip_address(host).version:
-        return  # a host has addresses of both kinds, and a machine is declared with one
-    message = (
-        f"cannot listen on {url.address!r} for {node.key!r}: its machine {node.machine!r} has the "
-        f"address {host}"
-    )
-    hint = "leave the address out to listen on every interface"
-    yield error("check.connection-address", at, message, hint)
+        if port is not None:
+            yield _Use(
+                host=host,
+                tcp=url.transport.is_tcp,
+                group=group and attribute == "port",
+                address="" if group or attribute == "output_port" else url.address,
+                port=port,
+                what=f"{word} {what}",
+                at=at,
+            )
 
 
 def _collisions(uses: list[_Use]) -> Iterator[Diagnostic]:
@@ -177,71 +113,6 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
         base = domain_base(domain)
         hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
         yield error("check.connection-ports", use.at, message, hint)
-
-
-def _peers(
-    system: DeclaredSystem, url: ConnectionUrl, at: Position, contacts: set[tuple[str, int]]
-) -> Iterator[Diagnostic]:
-    """Warn of peers that match no participant of the system."""
-    discovery = system.manifest.discovery
-    planned = discovery.mode is not DiscoveryMode.DYNAMIC and not discovery.transport.in_memory
-    domain = domain_base(discovery.domain_id or 0)
-    for peer in url.peers:
-        if peer.port is None or planned or domain <= peer.port < domain + DG:
-            continue
-        if (peer.address, peer.port) in contacts:
-            continue
-        near = sorted(port for address, port in contacts if address == peer.address)
-        spelled = ", ".join(str(Peer(address=peer.address, port=each)) for each in near)
-        message = f"cannot find a participant of this system at {str(peer)!r}"
-        hint = (
-            f"planned there: {spelled}"
-            if near
-            else "no connection listens at that address: 'metatraffic_port' is what peers name"
-        )
-        yield warning("check.connection-peer", at, message, hint)
-
-
-def _loopback(
-    system: DeclaredSystem,
-    node: Node,
-    connection: ConnectionDeclaration,
-    url: ConnectionUrl,
-    at: Position,
-) -> Iterator[Diagnostic]:
-    """Judge loopback addresses where what is carried has an end elsewhere."""
-    if url.transport.is_group:
-        return
-    local = [str(each) for each in url.peers if is_loopback(each.address)]
-    if is_loopback(url.address):
-        local.insert(0, url.address)
-    if not local or any(not is_loopback(each.address) for each in url.peers):
-        return
-    for kind, name in connection.map:
-        for key in _remote_nodes(system, node, kind, name):
-            message = (
-                f"cannot reach {key!r}, which {name!r} of {node.key!r} is for, by {local[0]!r}: "
-                "a loopback address never leaves its host, and they are on different machines"
-            )
-            yield error("check.connection-address", at, message, "use the machines' addresses")
-            return
-
-
-def _remote_nodes(
-    system: DeclaredSystem, node: Node, kind: EndpointKind, name: str
-) -> Iterator[str]:
-    """Yield nodes of other hosts that have the other end of a topic."""
-    mine = [
-        each.name
-        for each in system.endpoints
-        if each.node.key == node.key and (each.endpoint.kind, each.endpoint.name) == (kind, name)
-    ]
-    if not kind.is_topic or not mine:
-        return
-    host = system.manifest.address_of(node.machine)
-    for each in system.named(kind.other_end, mine[0]):
-        if system.manifest.address_of(each.node.machine) != host:
-            yield each.node.key
 
 
 def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:

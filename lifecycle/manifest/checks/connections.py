@@ -1,16 +1,12 @@
 """Checks that endpoints have counterparts that match, and of the `connections:` that nodes declare.
 
-Owns: check.unpublished, check.unheard, check.no-server, whose severity is the manifest's policy;
-check.qos-incompatible, check.qos-doubtful, by the rule of `lifecycle.manifest.qos`;
-check.type-unknown, check.type-not-installed, check.type-mismatch, which read the ament index;
-check.connection-endpoint, check.connection-name, check.connection-foreign, check.connection-flow.
-Addresses and ports of connections are checked by `connection_urls`.
+QoS is judged by the rule of `lifecycle.manifest.qos`; types are looked up in the ament index.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import (
@@ -19,7 +15,6 @@ from lifecycle.manifest.checks.system import (
     implicit_names,
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
-from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.installed_types import TypeLookup, TypeStatus, look_up
 from lifecycle.manifest.model import (
     Authority,
@@ -32,7 +27,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.dscp import describe
 
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",
@@ -93,7 +87,7 @@ def check_connections(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield from _foreign(system, node)
         for each in node.connections:
             yield from _name(system, node, each, hidden)
-            yield from _flows(node, each, system)
+            yield from _lossy(node, each, system)
 
 
 def _foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
@@ -174,93 +168,22 @@ def _name(
         yield error("check.connection-name", connection.at, message, "choose another name")
 
 
-def _flows(
+def _lossy(
     node: Node, connection: ConnectionDeclaration, system: DeclaredSystem
 ) -> Iterator[Diagnostic]:
-    """Judge needs of flows against the connection that carries them."""
-    found = [
-        (kind, each)
-        for kind, name in connection.map
-        if (each := system.needs.of(node.key, kind, name)) is not None
-    ]
-    for _, each in found:
-        yield from _lossy(connection, each)
-    publisher = EndpointKind.PUBLISHER
-    publishers = [name for kind, name in connection.map if kind is publisher]
-    for kind, each in found:
-        if kind is publisher:
-            yield from _apart(node, connection, each, publishers, system)
-        elif each.dscp is not None:
-            sharing = [(name, system.needs.of(node.key, publisher, name)) for name in publishers]
-            sharing += [
-                (one.need.name, one)
-                for other, one in found
-                if other is kind and one.dscp is not None and one is not each
-            ]
-            yield from _marked_apart(connection, each, sharing)
-
-
-def _lossy(connection: ConnectionDeclaration, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    transports = [url.transport for url in connection.urls]
-    if each.need.lossy is False and transports and all(one.is_group for one in transports):
+    """Judge data that must arrive against the connection that carries them."""
+    if not all(url.transport.is_group for url in connection.urls):
+        return
+    for kind, name in connection.map:
+        each = system.needs.of(node.key, kind, name)
+        if each is None or each.need.lossy is not False:
+            continue
         message = (
-            f"cannot carry {each.need.kind.noun} {each.need.name!r}, whose data are declared not "
-            f"lossy, by multicast alone, as connection {connection.name!r} does"
+            f"cannot carry {kind.noun} {name!r}, whose data are declared not lossy, by multicast "
+            f"alone, as connection {connection.name!r} does"
         )
         hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
         yield error("check.connection-flow", each.need.at, message, hint)
-
-
-def _apart(
-    node: Node,
-    connection: ConnectionDeclaration,
-    each: ResolvedNeed,
-    publishers: list[str],
-    system: DeclaredSystem,
-) -> Iterator[Diagnostic]:
-    """Judge whether a publisher may share the connection with those that it is shared with."""
-    rule, name = "check.connection-flow", each.need.name
-    others = [other for other in publishers if other != name]
-    if each.unique and others:
-        message = (
-            f"cannot give publisher {name!r} a flow of its own on connection "
-            f"{connection.name!r}: it also carries {', '.join(map(repr, others))}, from the same "
-            "sockets"
-        )
-        yield error(rule, each.need.at, message, "give it a connection of its own")
-    if each.dscp is not None:
-        sharing = [(name, system.needs.of(node.key, each.need.kind, name)) for name in others]
-        yield from _marked_apart(connection, each, sharing)
-
-
-def _marked_apart(
-    connection: ConnectionDeclaration,
-    each: ResolvedNeed,
-    sharing: Sequence[tuple[str, ResolvedNeed | None]],
-) -> Iterator[Diagnostic]:
-    """Judge whether the sockets of the connection may carry the mark of one endpoint.
-
-    `sharing` has the name and need of those that send from them too.
-    """
-    assert each.dscp is not None
-    rule, noun, name = "check.connection-flow", each.need.kind.noun, each.need.name
-    marks = {url.dscp for url in connection.urls if url.dscp is not None}
-    for mark in sorted(marks - {each.dscp}):
-        message = (
-            f"cannot mark {noun} {name!r} {describe(each.dscp)}: a URL of connection "
-            f"{connection.name!r} says {describe(mark)}"
-        )
-        yield error(rule, each.need.at, message, "say it once")
-    for other, resolved in sharing:
-        theirs = resolved.dscp if resolved else None
-        if theirs == each.dscp:
-            continue
-        has = describe(theirs) if theirs is not None else "no DSCP"
-        message = (
-            f"cannot mark {noun} {name!r} {describe(each.dscp)} on connection "
-            f"{connection.name!r}: {other!r} shares its sockets and has {has}"
-        )
-        yield error(rule, each.need.at, message, "give it a connection of its own")
 
 
 _MANUAL = "MANUAL_BY_TOPIC"

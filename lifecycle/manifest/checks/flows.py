@@ -1,11 +1,4 @@
-"""Checks of network flow needs: DSCP, priority, 5QI, DSCPs as flow identifiers, and links.
-
-Owns: check.flow-unknown-endpoint, check.flow-dscp, check.transport-priority, check.flow-five-qi,
-check.five-qi-class, check.flow-impossible, check.flow-foreign; check.dscp-exhausted,
-check.dscp-not-unique, check.dscp-repurposed, the limits that *Unique Network Flows* gives for the
-DSCP as an identifier; check.link-unknown-node, check.link-topic, check.link-not-unique: the ends of
-a link exist, meet on the topic, and ask for what the link demands. Pure.
-"""
+"""Checks of network flow needs: DSCP and 5QI; of links, whose ends must exist and ask. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +10,6 @@ from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
     EndpointKind,
-    FlowIdentification,
     FlowNeed,
     Link,
     Node,
@@ -27,8 +19,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network.dscp import MAX_DSCP, describe
-from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -70,32 +60,14 @@ def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
 
 def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     need = each.need
-    given = [
-        word
-        for word, value in (("a DSCP", need.dscp), ("a priority", need.transport_priority))
-        if value is not None
-    ]
-    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
+    marks = need.dscp is not None and need.kind is EndpointKind.SUBSCRIPTION
+    if marks and _is_best_effort(node, need):
         message = (
-            f"cannot mark anything that subscription {need.name!r} sends with {given[0]}: it is "
+            f"cannot mark anything that subscription {need.name!r} sends with a DSCP: it is "
             f"BEST_EFFORT and acknowledges nothing"
         )
         hint = "make it RELIABLE, or mark the publishers of the topic"
         yield note("check.flow-dscp", need.at, message, hint)
-    if len(given) > 1:
-        message = (
-            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
-            f"the whole mark"
-        )
-        yield error("check.flow-dscp", need.at, message, f"keep one; {_both(need)}")
-        return
-    message, hint = each.marking.problem
-    if message and need.transport_priority is not None:
-        yield error("check.flow-dscp", need.at, message, hint)
-    for advice in each.marking.notes:
-        rule = "check.five-qi-class" if need.transport_priority is None else ""
-        message, _, hint = advice.partition("; ")
-        yield note(rule or "check.transport-priority", need.at, message, hint)
 
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:
@@ -103,11 +75,6 @@ def _is_best_effort(node: Node, need: FlowNeed) -> bool:
     endpoint = node.interface.find(need.kind, need.name)
     qos = None if endpoint is None else endpoint.qos
     return qos is not None and qos.reliability is Reliability.BEST_EFFORT
-
-
-def _both(need: FlowNeed) -> str:
-    dscp, priority = need.dscp or 0, need.transport_priority or 0
-    return f"the one is {describe(dscp)}, the other goes through a mapping from {priority:#x}"
 
 
 def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -120,21 +87,6 @@ def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
         make = error if issue.field in _KEPT_BY_CLASS else note
         hint = "choose another class, or write 'five_qi: auto'"
         yield make("check.five-qi-class", need.at, issue.message, hint)
-    if need.five_qi is None or class_.five_qi is None:
-        return
-    try:
-        known = five_qi_of(class_.five_qi)
-    except ValueError:
-        message = (
-            f"cannot check what {need.name!r} declares against 5QI {need.five_qi}: 128 to 254 are "
-            f"an operator's own"
-        )
-        if each.max_delay_ms is not None or need.loss is not None:
-            yield note("check.five-qi-class", need.at, message, "ask that operator")
-        return
-    if known.flagged:
-        message = f"cannot be sure of {', '.join(known.flagged)} of {known}: {known.note}"
-        yield note("check.five-qi-class", need.at, message, "choose another, or ask the operator")
 
 
 def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -157,109 +109,6 @@ def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     if need.non_blocking_send:
         message = f"cannot make {what} send without waiting: its participant is not ours"
         yield warning("check.flow-blocks", need.at, message, hint)
-
-
-_DSCP_VALUES = MAX_DSCP + 1
-_ASK = "ask for 'unique: strictly_required', or give each a DSCP of its own"
-_OWN = "give it another DSCP, or none: then it gets one that nobody has"
-
-
-def check_identifiers(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about publishers that are identified by their DSCP.
-
-    All nodes are counted. The article counts subscriptions too; here their ports distinguish them,
-    and a DSCP that one acknowledges with must only not be an identifier of another's.
-    """
-    if system.manifest.network.flow_identification is FlowIdentification.DSCP:
-        yield from _repurposed(system)
-    else:
-        yield from _relied_on(system)
-
-
-def _needy(system: DeclaredSystem, kind: EndpointKind) -> Iterator[tuple[Resolved, ResolvedNeed]]:
-    """Yield the endpoints of a kind that ask something of their flows."""
-    for each in system.endpoints:
-        need = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-        if need is not None and each.endpoint.kind is kind:
-            yield each, need
-
-
-def _repurposed(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    publishers = list(_needy(system, EndpointKind.PUBLISHER))
-    relying = {id(need) for _, need in _relying(system)}
-    asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
-    others = [
-        *(each for each in publishers if not (each[1].unique or id(each[1]) in relying)),
-        *_needy(system, EndpointKind.SUBSCRIPTION),
-    ]
-    for _, need in asking:
-        message, hint = need.marking.problem
-        if message and need.need.transport_priority is None:
-            yield error("check.dscp-exhausted", need.need.at, message, hint)
-    holders: dict[int, Resolved] = {}
-    for each, need in asking:
-        if need.dscp is not None:
-            holders.setdefault(need.dscp, each)
-    for each, need in (*asking, *others):
-        other = None if need.dscp is None else holders.get(need.dscp)
-        if need.dscp is not None and other is not None and other is not each:
-            message = (
-                f"cannot give {each.endpoint.kind.noun} {each.name!r} of {each.node.key!r} "
-                f"{describe(need.dscp)}: it identifies {other.name!r} of {other.node.key!r} "
-                f"({other.at.spelled})"
-            )
-            yield error("check.dscp-not-unique", need.need.at, message, _OWN)
-    at = system.manifest.positions.get("network")
-    if asking and at is not None:
-        message = (
-            f"cannot be sure that the network takes {len(asking)} of {_DSCP_VALUES} DSCP values "
-            f"for identifiers: routers read them as classes, and may reset or erase them"
-        )
-        hint = (
-            "tell those who run the network and configure each router on the way, or use "
-            "'flow_identification: participant'"
-        )
-        yield note("check.dscp-repurposed", at, message, hint)
-
-
-def _relied_on(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Judge publishers that only their DSCP distinguishes although that is declared nowhere.
-
-    A link may demand a unique flow of a publisher that asks for none but is marked: then its DSCP
-    is re-purposed as the identifier, and of those there are 64, all else in the NFE being equal.
-    """
-    holders: dict[int, Resolved] = {}
-    relying = list(_relying(system))
-    for number, (each, need) in enumerate(relying, start=1):
-        assert need.dscp is not None
-        other = holders.setdefault(need.dscp, each)
-        if number > _DSCP_VALUES:
-            message = (
-                f"cannot tell publisher {each.name!r} of {each.node.key!r} apart by its DSCP: it "
-                f"is number {number} of {len(relying)} that have nothing else, and a DSCP has "
-                f"{_DSCP_VALUES} values"
-            )
-            yield error("check.dscp-exhausted", need.need.at, message, _ASK)
-        elif other is not each:
-            message = (
-                f"cannot tell publisher {each.name!r} of {each.node.key!r} apart by "
-                f"{describe(need.dscp)}: {other.name!r} of {other.node.key!r} has the same "
-                f"({other.at.spelled})"
-            )
-            yield error("check.dscp-not-unique", need.need.at, message, _ASK)
-
-
-def _relying(system: DeclaredSystem) -> Iterator[tuple[Resolved, ResolvedNeed]]:
-    demanded = {
-        (link.from_node, link.topic)
-        for link in system.manifest.links
-        if link.unique is not UniqueHow.NOT
-    }
-    for each, need in _needy(system, EndpointKind.PUBLISHER):
-        if need.dscp is None or need.need.unique is not UniqueRequirement.NOT_REQUIRED:
-            continue
-        if (each.node.key, each.name) in demanded:
-            yield each, need
 
 
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
@@ -318,10 +167,9 @@ def _uniqueness(link: Link, ends: list[Resolved], system: DeclaredSystem) -> Ite
         for each in silent:
             message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
             yield error("check.link-not-unique", link.at, message, _remedy(each))
-    # A DSCP of its own makes an NFE unique as well; `check_identifiers` judges whether it is its
-    # own. That of a subscription is of its acknowledgements and distinguishes no data.
+    # A marked publisher has sockets beside its node's: whether alone is seen when it runs.
     marked = any(
-        _dscp(each, system) is not None
+        (need := _need(each, system)) is not None and need.dscp is not None
         for each in ends
         if each.endpoint.kind is EndpointKind.PUBLISHER
     )
@@ -346,18 +194,16 @@ def _remedy(each: Resolved) -> str:
     )
 
 
+def _need(each: Resolved, system: DeclaredSystem) -> ResolvedNeed | None:
+    return system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+
+
 def _asks(each: Resolved, system: DeclaredSystem) -> bool:
-    resolved = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+    resolved = _need(each, system)
     return resolved is not None and resolved.need.unique is not UniqueRequirement.NOT_REQUIRED
-
-
-def _dscp(each: Resolved, system: DeclaredSystem) -> int | None:
-    resolved = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-    return None if resolved is None else resolved.dscp
 
 
 CHECKS = (
     check_flows,
-    check_identifiers,
     check_links,
 )

@@ -1,9 +1,4 @@
-"""Checks of ROS names and remap rules: illegal names, duplicates, unused or colliding rules.
-
-Owns: check.name, check.duplicate-node, check.duplicate-endpoint, check.several-servers;
-check.remap-rule, check.remap-identity, check.remap-action, check.remap-unused,
-check.remap-shadowed, check.remap-collision. Pure.
-"""
+"""Checks of ROS names and remap rules: illegal, duplicate, unused or colliding ones. Pure."""
 
 from __future__ import annotations
 

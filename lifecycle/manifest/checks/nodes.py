@@ -1,12 +1,4 @@
-"""Checks of where and in which order nodes start: machines, processes, domain, ports, `after`.
-
-Owns: check.unknown-machine, check.process-machine, check.process-run, check.process-environment,
-check.process-name, check.ros-args, check.container, check.may-end, check.state, check.restart,
-check.start-limit, check.health, check.on-violation, check.mode, check.domain, check.ports,
-check.localhost, check.after-unknown, check.after-self, check.after-cycle, check.after-unmanaged,
-check.after-state.
-Port arithmetic is in `lifecycle.network`. Pure.
-"""
+"""Checks of where and in which order nodes start: machines, processes, ports, `after`. Pure."""
 
 from __future__ import annotations
 

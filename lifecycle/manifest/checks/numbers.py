@@ -1,7 +1,4 @@
-"""Declared rates, delays and silences against each other: what no system could keep. Pure.
-
-Owns: check.flow-number: a number that says nothing, or that contradicts another one of its flow.
-"""
+"""Declared rates, delays and silences against each other: what no system could keep. Pure."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
 """Checks of ROS parameters and parameter files (YAML) against the parameters an interface declares.
 
-Owns: check.parameter-undeclared, check.parameter-type, check.parameter-unused, also for values in
-files; check.parameter-file, check.parameter-file-unmatched; check.mode for parameters of modes;
-whether a value fits a type of rcl_interfaces/ParameterType; what a command line sets of parameters.
-
-An interface that declares no parameters leaves them open, so nothing is checked then.
+Owns: whether a value fits a type of rcl_interfaces/ParameterType; what a command line sets of
+parameters. An interface that declares no parameters leaves them open: nothing is checked then.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Checks of what nodes wait for that others show in the graph: what they can never show.
-
-Owns: check.after-undeclared, check.after-twice, check.after-value. Pure.
-"""
+"""Checks of what nodes wait for that others show in the graph: what they can never show. Pure."""
 
 from __future__ import annotations
 
@@ -19,29 +16,17 @@ from lifecycle.manifest.yaml.document import error, note
 def check_readiness(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about topics, services and parameters that others are waited for to have."""
     for node in system.manifest.nodes:
-        first: dict[tuple[str, ReadyBy, str], After] = {}
         for after in node.after:
             other, wanted = system.nodes.get(after.node), after.condition
             if other in (None, node) or not isinstance(wanted, Readiness):
                 continue
-            name = _in_graph(other, wanted)
-            once = first.setdefault((after.node, wanted.by, name), after)
-            if once is not after:
-                message = f"cannot wait twice until {after.node!r} {wanted}"
-                hint = f"the first is at {once.at.spelled}"
-                yield error("check.after-twice", after.at, message, hint)
-            elif wanted.by is ReadyBy.PARAMETER:
+            if wanted.by is ReadyBy.PARAMETER:
                 yield from _parameter(after, wanted, other, system)
             elif problem := name_problem(wanted.name):
                 message = f"cannot wait until {after.node!r} {wanted}: {problem}"
                 yield error("check.name", after.at, message)
             else:
                 yield from _endpoint(after, wanted, other, system)
-
-
-def _in_graph(node: Node, wanted: Readiness) -> str:
-    names = (topic_of(node, wanted.name, kind) for kind in wanted.by.kinds)
-    return next(filter(None, names), wanted.name)
 
 
 def _endpoint(

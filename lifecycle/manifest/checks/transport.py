@@ -1,11 +1,7 @@
 """Checks of discovery and transport: range, RMW, discovery server, media of flows, datagram sizes.
 
-Owns: check.discovery-range, check.discovery-address, check.discovery-rmw,
-check.discovery-transport, check.discovery-server, check.discovery-foreign, check.authority;
-check.flow-transport, check.flow-fragments, check.ipv6-transports, check.rmw. The capability
-table is in `lifecycle.network`; what happens at run time decides, check.rmw only fails earlier.
-Whether two nodes have a transport in common is the planner's to say (plan.unconnectable).
-Pure.
+What happens at run time decides; check.rmw only fails earlier.
+Whether two nodes have a transport in common is the planner's to say (plan.unconnectable). Pure.
 """
 
 from __future__ import annotations
@@ -33,7 +29,6 @@ from lifecycle.network.medium import (
     DEFAULT_RMW,
     DEFAULT_TCP,
     FAST_DDS,
-    RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     TRANSPORTS_VARIABLE,
     datagram_bytes,
@@ -57,7 +52,6 @@ def check_discovery(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield from _rmws(system, section)
         for node in system.manifest.nodes:
             yield from _foreign_rmws(discovery, node)
-            yield from _unfound(system, node)
     yield from _authority(system)
 
 
@@ -215,30 +209,6 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
         why = "no variable gives a process fixed ports and peers"
     message = f"cannot take {node.key!r} into {what}: {why}"
     hint = "write it as 'run: {python: module:Class}', or use 'mode: dynamic'"
-    yield error("check.discovery-foreign", node.where("run"), message, hint)
-
-
-def _unfound(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Judge a command that is configured to use IPv6 and to look on this host alone.
-
-    rmw_fastrtps_cpp 8.4 does the latter by the peer 127.0.0.1, and no variable names another.
-    """
-    discovery = system.manifest.discovery
-    reach = discovery.range.name
-    if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
-        reach = system.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", reach)
-    if (
-        node.run.kind is not RunKind.COMMAND
-        or discovery.mode is not DiscoveryMode.DYNAMIC
-        or (discovery.transport.medium or RMW_DISCOVERY).ip_version != 6
-        or reach != DiscoveryRange.LOCALHOST.name
-    ):
-        return
-    message = (
-        f"cannot find {node.key!r} by {discovery.transport.value} in range localhost: its RMW "
-        "looks for others at 127.0.0.1 only"
-    )
-    hint = "use 'range: subnet', or 'transport: udpv4'"
     yield error("check.discovery-foreign", node.where("run"), message, hint)
 
 

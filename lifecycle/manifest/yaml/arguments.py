@@ -9,7 +9,6 @@ is one whole unquoted value.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 
 import msgspec
@@ -301,49 +300,32 @@ class _Substitution:
         Raises:
             LifecycleError: why there is none; without message where that is already reported.
         """
-        if each.kind == "arg":
-            return self._argument("".join(map(str, each.words[0])), place)
         if each.kind == "env":
             name, *default = each.words
-            return self._surroundings.variable(
-                "".join(map(str, name)),
-                (lambda: self._text(default[0], place)) if default else None,
-            )
-        if each.kind == "command" and each.is_one_quoted:
-            # $(command 'xacro $(arg model)'), as launch files have it, is several words.
-            words = self._words_of(each.words[0], place)
-        else:
-            words = [self._text(word, place) for word in each.words]
-        return self._of_words(each, words)
-
-    def _of_words(self, each: Substitution, words: list[str]) -> str:
+            return self._variable(self._text(name, place), default, place)
+        words = [self._text(word, place) for word in each.words]
+        if each.kind == "arg":
+            return self._argument(words[0], place)
         if each.kind == "command":
             return self._command(words, each.written)
-        if each.kind not in ("file", "find-pkg-share"):
-            return decide(each.kind, words, each.written)
-        if len(words) != 1:
-            message = f"cannot substitute {quote(each.written)}; it takes one word"
-            raise LifecycleError(message, hint="put a word that has spaces in quotes")
         if each.kind == "find-pkg-share":
             return self._surroundings.package_share(words[0])
-        return self._surroundings.file(words[0])
+        if each.kind == "file":
+            return self._surroundings.file(words[0])
+        return decide(each.kind, words, each.written)
 
-    def _words_of(self, parts: Text, place: Place) -> list[str]:
-        """Split text at its spaces; what a substitution in it becomes is never split."""
-        words = [""]
-        for each in parts:
-            if not isinstance(each, str):
-                words[-1] += self._substituted(each, place)
-                continue
-            first, *rest = re.split(r"\s+", each)
-            words[-1] += first
-            words += rest
-        return [each for each in words if each]
+    def _variable(self, name: str, default: list[Text], place: Place) -> str:
+        found = self._surroundings.environment.get(name)
+        if found is not None:
+            return found
+        if default:
+            return self._text(default[0], place)
+        raise LifecycleError(
+            f"cannot find the environment variable {name!r}",
+            hint=f"set it, or write $(env {name} DEFAULT)",
+        )
 
     def _command(self, words: list[str], written: str) -> str:
-        if not words or not words[0]:
-            message = f"cannot substitute {quote(written)}; it names no program"
-            raise LifecycleError(message, hint="write $(command PROGRAM ARGUMENT …)")
         programs = self._surroundings.programs
         if programs is None:
             raise NotRunError(

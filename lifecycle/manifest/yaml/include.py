@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import msgspec
-
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.yaml.document import Document, error
@@ -22,33 +20,20 @@ MAX_DOCUMENTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-class Origin(msgspec.Struct, frozen=True, kw_only=True):
-    """A manifest file in the chain of includes.
-
-    Attributes:
-        path: the file.
-        identity: its path without links, to recognise it again.
-    """
-
-    path: Path
-    identity: str
-
-    @property
-    def shown(self) -> str:
-        """How messages name the file: bytes that are no UTF-8 could be neither shown nor sent."""
-        return os.fsencode(self.path).decode("utf-8", errors="replace")
-
-    @classmethod
-    def of(cls, path: Path) -> Origin:
-        """Return the origin of a path as the user wrote it."""
-        try:
-            identity = os.path.realpath(path)
-        except (OSError, ValueError):  # a name that no file can have; opening it reports that
-            identity = str(path)
-        return cls(path=path, identity=identity)
+def shown(path: Path) -> str:
+    """Return how messages name a file: bytes that are no UTF-8 could be neither shown nor sent."""
+    return os.fsencode(path).decode("utf-8", errors="replace")
 
 
-def locate(entry: Document, chain: tuple[Origin, ...], found: Findings) -> Origin | None:
+def _identity(path: Path) -> str:
+    """Return a path without links, to recognise a file again."""
+    try:
+        return os.path.realpath(path)
+    except (OSError, ValueError):  # a name that no file can have; opening it reports that
+        return str(path)
+
+
+def locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
     """Return the file that an entry of `include:` names; None after reporting why there is none.
 
     Args:
@@ -57,14 +42,12 @@ def locate(entry: Document, chain: tuple[Origin, ...], found: Findings) -> Origi
         found: findings are appended here.
     """
     name = entry.text("manifest")
-    at = entry.at(("manifest",))
-    path = Path(os.path.normpath(chain[-1].path.parent / name))
-    origin = Origin.of(path)
-    identities = [each.identity for each in chain]
+    path = Path(os.path.normpath(chain[-1].parent / name))
+    identities = [_identity(each) for each in chain]
     message, hint = "", ""
-    if origin.identity in identities:
-        round_trip = [*chain[identities.index(origin.identity) :], origin]
-        names = " → ".join(each.path.name for each in round_trip)
+    if (identity := _identity(path)) in identities:
+        round_trip = [*chain[identities.index(identity) :], path]
+        names = " → ".join(each.name for each in round_trip)
         message = f"cannot include {quote(name)}: it would include itself, {names}"
     elif len(chain) == MAX_DEPTH:
         message = f"cannot include {quote(name)}: at most {MAX_DEPTH} manifests in a row"
@@ -74,8 +57,8 @@ def locate(entry: Document, chain: tuple[Origin, ...], found: Findings) -> Origi
     elif path.is_dir():
         message = f"cannot include {quote(name)}: it is a directory"
     if not message:
-        return origin
-    found.append(error("manifest.include", at, message, hint))
+        return path
+    found.append(error("manifest.include", entry.at(("manifest",)), message, hint))
     return None
 
 

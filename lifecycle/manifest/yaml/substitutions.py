@@ -18,7 +18,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -38,16 +38,26 @@ COMMAND_S = 10.0
 
 ALLOWED = (
     "write $(arg NAME), $(env NAME), $(env NAME DEFAULT), $(find-pkg-share PACKAGE), $(file PATH), "
-    "$(command PROGRAM …), $(equals A B), $(not-equals A B), $(not A), $(and A B) or $(or A B); "
-    "$$( is a literal $("
+    "$(command PROGRAM …), $(equals A B), $(not-equals A B), $(not A), $(and A B) or $(or A B), "
+    "a word that is empty or has spaces in quotes; $$( is a literal $("
 )
 
-_RAW = ("arg", "env")
-_WORDS = ("find-pkg-share", "file", "command", "not", "and", "or", "equals", "not-equals")
+_WORDS: Mapping[str, tuple[int, int | None]] = {
+    "arg": (1, 1),
+    "env": (1, 2),
+    "find-pkg-share": (1, 1),
+    "file": (1, 1),
+    "command": (1, None),
+    "not": (1, 1),
+    "and": (2, None),
+    "or": (2, None),
+    "equals": (2, 2),
+    "not-equals": (2, 2),
+}
+"""Fewest and most words that follow a kind; None for any number."""
+
 _KIND = re.compile(r"\s*([^\s()$'\"]*)")
 _SPACE = re.compile(r"\s*")
-_NAMED = re.compile(r"\s*\S+\s+(\S+)(?:\s(.*))?\Z", re.DOTALL)
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _ELSEWHERE = {
     "eval": "a manifest computes nothing; write $(equals A B), $(not-equals A B), $(not A), "
     "$(and A B) or $(or A B), or have an argument give the value",
@@ -72,14 +82,12 @@ class Substitution(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         kind: `arg`, `command`, ….
         written: as it is written.
-        words: what follows the kind; of `arg` and `env` the name, and the default if there is one.
-        is_one_quoted: it is one word in quotes.
+        words: what follows the kind, as many as it takes.
     """
 
     kind: str
     written: str
     words: tuple[Text, ...]
-    is_one_quoted: bool = False
 
 
 def parse_text(text: str) -> Text:
@@ -117,8 +125,6 @@ def _substitution(text: str, begin: int, depth: int) -> tuple[Substitution, int]
     match = _KIND.match(text, begin + 2)
     assert match is not None
     kind = match[1]
-    if kind in _RAW:
-        return _raw(text, begin, kind, depth)
     if kind in _WORDS:
         return _worded(text, begin, kind, match.end(), depth)
     whole = text[begin : _closing(text, begin)]
@@ -136,43 +142,19 @@ def _closing(text: str, begin: int) -> int:
     return len(text)
 
 
-def _raw(text: str, begin: int, kind: str, depth: int) -> tuple[Substitution, int]:
-    """Read `$(env NAME DEFAULT)`, whose default is text with anything but parentheses."""
-    parts, at = _parse(text, begin + 2, "()", depth)
-    written = text[begin : at + 1]
-    if text[at : at + 1] != ")":
-        raise LifecycleError(f"cannot substitute {quote(text[begin:at])}", hint=ALLOWED)
-    first, *rest = parts
-    named = _NAMED.match(first if rest else first.rstrip()) if isinstance(first, str) else None
-    if named is None or not _NAME.match(named[1]) or (rest and named[2] is None):
-        raise LifecycleError(f"cannot substitute {quote(written)}", hint=ALLOWED)
-    name, default = named.groups()
-    if rest and isinstance(rest[-1], str):
-        rest[-1] = rest[-1].rstrip()
-    if kind == "arg" and default is not None:
-        raise LifecycleError(
-            f"cannot give a default in {quote(written)}",
-            hint=f"declare it: arguments: {{{name}: {{default: …}}}}",
-        )
-    words: tuple[Text, ...] = ((name,),) if default is None else ((name,), (default, *rest))
-    return Substitution(kind=kind, written=written, words=words), at + 1
-
-
 def _worded(text: str, begin: int, kind: str, at: int, depth: int) -> tuple[Substitution, int]:
     """Read words, in quotes or not, up to the closing parenthesis."""
     words: list[Text] = []
-    quoted: list[bool] = []
+    least, most = _WORDS[kind]
     while True:
         space = _SPACE.match(text, at)
         assert space is not None
         at = space.end()
         mark = text[at : at + 1]
-        if mark == ")":
+        if mark == ")" and least <= len(words) <= (most or len(words)):
             written = text[begin : at + 1]
-            one = quoted == [True]
-            found = Substitution(kind=kind, written=written, words=tuple(words), is_one_quoted=one)
-            return found, at + 1
-        if mark in ("", "("):
+            return Substitution(kind=kind, written=written, words=tuple(words)), at + 1
+        if mark in ("", "(", ")"):
             whole = text[begin : _closing(text, begin)]
             raise LifecycleError(f"cannot substitute {quote(whole)}", hint=ALLOWED)
         is_quoted = mark in "'\""
@@ -183,7 +165,6 @@ def _worded(text: str, begin: int, kind: str, at: int, depth: int) -> tuple[Subs
                 raise LifecycleError(message)
             at += 1
         words.append(word)
-        quoted.append(is_quoted)
 
 
 def truth(text: str) -> bool | None:
@@ -195,13 +176,8 @@ def decide(kind: str, words: list[str], written: str) -> str:
     """Return `true` or `false` of a `$(not …)`, `$(equals …)` and the others.
 
     Raises:
-        LifecycleError: too few or too many words, or one that is neither true nor false.
+        LifecycleError: a word is neither true nor false.
     """
-    least, most = {"not": (1, 1), "and": (2, None), "or": (2, None)}.get(kind, (2, 2))
-    if len(words) < least or (most is not None and len(words) > most):
-        needs = {"not": "one word", "and": "two or more words", "or": "two or more words"}
-        message = f"cannot substitute {quote(written)}; it takes {needs.get(kind, 'two words')}"
-        raise LifecycleError(message, hint="put a word that is empty or has spaces in quotes")
     if kind in ("equals", "not-equals"):
         return _spelled((words[0] == words[1]) == (kind == "equals"))
     truths = [truth(each) for each in words]
@@ -339,22 +315,6 @@ class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
     environment: Mapping[str, str]
     folder: str
     programs: Programs | None
-
-    def variable(self, name: str, default: Callable[[], str] | None) -> str:
-        """Return an environment variable; the default where it is not set.
-
-        Raises:
-            LifecycleError: it is not set, and there is no default.
-        """
-        found = self.environment.get(name)
-        if found is None and default is not None:
-            return default()
-        if found is None:
-            raise LifecycleError(
-                f"cannot find the environment variable {name!r}",
-                hint=f"set it, or write $(env {name} DEFAULT)",
-            )
-        return found
 
     def package_share(self, name: str) -> str:
         """Return `PREFIX/share/NAME` of an installed package.

@@ -35,7 +35,7 @@ _JUDGED = frozenset(
     (
         *("check.qos-doubtful", "check.type-not-installed", "check.parameter-empty-array"),
         *("check.flow-foreign", "check.flow-transport", "check.ipv6-transports"),
-        *("check.connection-peer", "yaml.tag"),
+        "yaml.tag",
     )
 )
 """Rules of `check` whose matter is judged where the system runs, by the rule that is about it."""

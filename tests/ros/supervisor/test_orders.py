@@ -539,7 +539,7 @@ def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
     if shown_by == "diagnostics":
         said = "'talker: mood': in a mood"
         edit["nodes/talker/run"]["python"] = "tests.ros.supervisor.systems:Diagnosed"
-        edit["nodes/talker/health"] = {"diagnostics": "talker: *"}
+        edit["nodes/talker/health"] = {"diagnostics": ["talker: *"]}
         edit["nodes/talker/interface/publishers"] = [
             {"name": "chatter", "type": "std_msgs/msg/String"},
             {"name": "diagnostics", "type": "diagnostic_msgs/msg/DiagnosticArray"},

@@ -171,7 +171,7 @@ nodes:
     machine: Left_Arm
     timeouts: {configure_s: 400, deactivate_s: 90}
   hand: {run: {command: [hand]}, machine: right_arm, restart: always, after: {arm: active}}
-  eye: {run: {command: [eye]}, machine: _base, health: {diagnostics: "eye: *"}}
+  eye: {run: {command: [eye]}, machine: _base, health: {diagnostics: ["eye: *"]}}
   cart: {run: {command: [cart]}, parameters: {what: $(arg what)}}
 """
 SIGNS = 'x y\nTimeoutStartSec=1\n %h $HOME ${A} "q" \' \\ ; é \t'

@@ -54,7 +54,7 @@ def _value(written: str, value: str) -> object:
         ("$HOME", "7", "$HOME"),
         ("$(arg x)", "$(arg x)", "$(arg x)"),
         ("$(env NOT_SET 7)", "", 7),
-        ("$(env NOT_SET two words)", "", "two words"),
+        ("$(env NOT_SET 'two words')", "", "two words"),
     ],
 )
 def test_what_a_substitution_becomes(written: str, value: str, expected: object) -> None:

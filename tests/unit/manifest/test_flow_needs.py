@@ -6,21 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, identifiers, marking_of
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     EndpointKind,
-    FlowIdentification,
     FlowNeed,
     FlowTransport,
     Machine,
-    Manifest,
     Network,
-    Run,
-    RunKind,
 )
-from lifecycle.network.dscp import TransportPriorityMapping, code_points
-from lifecycle.network.five_qi import dscp_mapping, five_qi_of
+from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 from tests.builders import at, link, manifest, need, node, publisher, subscription
 
@@ -75,10 +70,6 @@ def test_the_smaller_datagram_serves_all_of_a_class():
     assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
 
 
-def test_a_priority_and_a_dscp_that_come_to_the_same_share():
-    assert carried(need(PUB, "a", dscp=46), need(PUB, "b", transport_priority=184)) == [("a", "b")]
-
-
 def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
     only = node(
         "n",
@@ -94,30 +85,6 @@ def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
     needs = FlowNeeds(manifest(only))
     assert needs.node_transports(only) == ("udpv4",)
     assert [(each.names, each.transports) for each in needs.groups(only)] == [(("c",), ("udpv4",))]
-
-
-def class_of_the_publisher(*hearers: FlowNeed | None, run: RunKind = RunKind.PYTHON):
-    source = node("source", publisher("a"), needs=[need(PUB, "a", five_qi=82)])
-    others = [
-        node(
-            f"hearer{index}",
-            subscription("a"),
-            needs=[each] if each else [],
-            run=Run(kind=run, python="m:C", command=("x",)),
-        )
-        for index, each in enumerate(hearers)
-    ]
-    return [each.five_qi for each in FlowNeeds(manifest(source, *others)).groups(source)]
-
-
-def test_a_5qi_needs_sockets_of_its_own_unless_the_subscriptions_tell_the_flow_apart():
-    unique = need(SUB, "a", STRICTLY)
-    assert class_of_the_publisher(unique) == []
-    assert class_of_the_publisher(unique, unique) == []
-    assert class_of_the_publisher(unique, None) == [82]
-    assert class_of_the_publisher(None) == [82]
-    assert class_of_the_publisher() == [82]
-    assert class_of_the_publisher(unique, run=RunKind.COMMAND) == [82]
 
 
 def test_publishers_of_one_5qi_share_and_of_two_do_not():
@@ -184,98 +151,6 @@ def test_network_transport_is_ipv6_where_the_machine_s_address_is():
         assert [each.transports for each in FlowNeeds(system).groups(only)] == [transports]
 
 
-# --- marks
-
-
-@pytest.mark.parametrize(
-    ("priority", "mapping", "dscp"),
-    [
-        (184, None, 46),  # without a mapping, the priority is the TOS byte
-        (0xB8, TransportPriorityMapping(mask=0xFF), 46),
-        (0, TransportPriorityMapping(mask=0x03, high=0x03), 0),
-        (3, TransportPriorityMapping(mask=0x03, high=0xFC), 63),
-        (184, TransportPriorityMapping(mask=0), None),
-    ],
-)
-def test_a_transport_priority_becomes_a_dscp(
-    priority: int, mapping: TransportPriorityMapping | None, dscp: int | None
-):
-    network = Network(transport_priority_mapping=mapping)
-    marking = marking_of(need(PUB, "a", transport_priority=priority), network, None)
-    assert (marking.dscp, marking.problem) == (dscp, ("", ""))
-
-
-def test_where_a_dscp_comes_from_is_said():
-    marking = marking_of(need(PUB, "a", transport_priority=184), Network(), None)
-    assert marking.reason == "transport_priority 184 (0xb8) with mask 0xff, low 0x0, high 0xff"
-
-
-def test_mask_0_marks_nothing_and_says_so():
-    network = Network(transport_priority_mapping=TransportPriorityMapping(mask=0))
-    marking = marking_of(need(PUB, "a", transport_priority=184), network, None)
-    assert marking.notes == (
-        "cannot mark anything with transport_priority 184 (0xb8): the mask is 0",
-    )
-
-
-def test_a_5qi_marks_only_where_a_mapping_is_asked_for():
-    asked = need(PUB, "a", five_qi=82)
-    mapping = dscp_mapping("azure_private_5g_core")
-    assert marking_of(asked, Network(), 82).dscp is None
-    marking = marking_of(asked, Network(five_qi_dscp=mapping), 82)
-    assert marking.dscp == mapping.dscp_for(82) == 18
-    assert marking.reason == "for 5QI 82 by mapping 'azure_private_5g_core'"
-
-
-def test_a_dscp_that_is_written_wins_over_the_mapping_of_the_5qi():
-    network = Network(five_qi_dscp=dscp_mapping("azure_private_5g_core"))
-    assert marking_of(need(PUB, "a", five_qi=82, dscp=46), network, 82).dscp == 46
-
-
-# --- DSCP values as identifiers
-
-
-def test_identifiers_that_mislead_least_come_first_and_default_forwarding_last():
-    order = identifiers([3, 46])
-    named = {each.dscp for each in code_points()}
-    assert len(order) == 62
-    assert order[:3] == (7, 11, 15)  # pool 2 of RFC 2474, for local use
-    assert not named & set(order[: 64 - len(named | {3})])
-    assert order[-1] == 0
-
-
-def of_dscp(count: int, *needs: FlowNeed) -> tuple[FlowNeeds, Manifest]:
-    nodes = [
-        node(f"n{index}", publisher("a"), needs=[need(PUB, "a", STRICTLY)])
-        for index in range(count)
-    ]
-    nodes.append(node("other", *(publisher(each.name) for each in needs), needs=needs))
-    system = manifest(*nodes, network=Network(flow_identification=FlowIdentification.DSCP))
-    return FlowNeeds(system), system
-
-
-def test_each_publisher_that_needs_it_gets_a_dscp_that_no_other_has():
-    needs, system = of_dscp(
-        20, need(PUB, "own", STRICTLY, dscp=3), need(PUB, "class", dscp=46), need(PUB, "none")
-    )
-    values = [needs.of(each.key, PUB, "a").dscp for each in system.nodes[:-1]]
-    assert None not in values
-    assert len({*values, 3, 46}) == 22
-    assert needs.of("other", PUB, "own").dscp == 3
-    assert needs.of("other", PUB, "none").dscp is None
-
-
-def test_a_publisher_that_others_start_cannot_be_marked_and_so_gets_no_identifier():
-    foreign = node(
-        "n",
-        publisher("a"),
-        needs=[need(PUB, "a", OPTIONALLY)],
-        run=Run(kind=RunKind.COMMAND, command=("x",)),
-    )
-    system = manifest(foreign, network=Network(flow_identification=FlowIdentification.DSCP))
-    assert FlowNeeds(system).of("n", PUB, "a").dscp is None
-
-
 # --- 5QI
 
 
@@ -315,13 +190,9 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(CORPUS)
     system = load("flows_every_key.lifecycle.yaml").manifest
     network = system.network
-    assert network.flow_identification is FlowIdentification.PARTICIPANT
-    assert network.transport_priority_mapping == TransportPriorityMapping(mask=0xFF)
-    assert network.five_qi_dscp is not None
-    assert network.five_qi_dscp.values == ((82, 34), (85, 46))
     assert network.max_datagram_bytes == 1300
     video, pose, alarm, log = system.nodes[0].flows
-    assert (video.unique, video.transport_priority, video.enforce) == (STRICTLY, 184, False)
+    assert (video.unique, video.dscp, video.enforce) == (STRICTLY, 46, False)
     assert (video.max_message_size, video.transport, video.non_blocking_send) == (
         60000,
         NETWORK,
@@ -329,7 +200,7 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     )
     assert (pose.five_qi, pose.five_qi_auto) == (None, True)
     assert (pose.max_delay_ms, pose.loss, pose.rate_hz) == (10.0, 1e-4, 50.0)
-    assert (alarm.five_qi, alarm.five_qi_auto, alarm.transport_priority) == (82, False, None)
+    assert (alarm.five_qi, alarm.five_qi_auto, alarm.dscp) == (82, False, None)
     assert (log.dscp, log.transport, log.non_blocking_send) == (8, FlowTransport.ANY, False)
     assert system.nodes[1].flows[0].transport is NETWORK
 
@@ -338,7 +209,7 @@ def test_an_included_manifest_does_not_bring_its_network(findings):
     part = """\
     manifest_version: 1
     system: part
-    network: {flow_identification: dscp}
+    network: {max_datagram_bytes: 1300}
     nodes: {n: {run: {python: "demo:N"}}}
     """
     found = findings("include: [{manifest: part.yaml}]\n", part_yaml=part)

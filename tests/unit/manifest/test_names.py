@@ -11,7 +11,6 @@ from lifecycle.manifest.names import (
     NameNotLegalError,
     RemapKind,
     RemapRule,
-    RemapRuleError,
     expand,
     full_name_problem,
     hidden_names,
@@ -227,7 +226,7 @@ def test_a_rule_knows_its_node_and_kind() -> None:
     ],
 )
 def test_a_rule_that_rcl_refuses_is_refused(match: str, replacement: str, message: str) -> None:
-    with pytest.raises(RemapRuleError) as caught:
+    with pytest.raises(NameNotLegalError) as caught:
         parse_rule(match, replacement)
     assert str(caught.value) == message
 
@@ -282,6 +281,6 @@ def test_any_text_as_a_rule_is_read_or_refused_with_a_reason(match: str, replace
     refused = ""
     try:
         rule = parse_rule(match, replacement)
-    except RemapRuleError as error:
+    except NameNotLegalError as error:
         refused = str(error)
     assert refused.startswith("cannot ") or rule.replacement == replacement

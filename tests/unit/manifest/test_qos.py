@@ -21,7 +21,6 @@ from lifecycle.manifest.qos import (
     QosProfile,
     Reliability,
     incompatibilities,
-    problems,
 )
 
 CERTAIN, POSSIBLE = Certainty.CERTAIN, Certainty.POSSIBLE
@@ -210,27 +209,3 @@ def test_presets_bear_the_names_of_ros() -> None:
 def test_presets_cannot_be_changed() -> None:
     with pytest.raises(TypeError):
         PRESETS["default"] = QosProfile()  # type: ignore[index]
-
-
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_every_preset_is_a_usable_profile(name: str) -> None:
-    assert problems(PRESETS[name]) == ()
-
-
-def test_keep_last_with_depth_0_is_refused() -> None:
-    assert problems(QosProfile(depth=0)) == (
-        "use depth 0 with KEEP_LAST: it would keep nothing; set depth >= 1",
-    )
-    assert problems(QosProfile(depth=0, history=History.KEEP_ALL)) == ()
-
-
-def test_a_negative_depth_is_refused() -> None:
-    assert problems(QosProfile(depth=-1)) == ("use depth -1: depth counts messages, 0 or more",)
-
-
-@pytest.mark.parametrize("field", ["deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"])
-@pytest.mark.parametrize("value", [-1, 2**63])
-def test_a_duration_outside_of_int64_is_refused(field: str, value: int) -> None:
-    profile = replace(QosProfile(), **{field: value})
-    assert problems(profile) == (f"use {field} {value}: a duration is 0 to 2**63-1 nanoseconds",)
-    assert problems(replace(QosProfile(), **{field: 2**63 - 1})) == ()

@@ -28,7 +28,7 @@ from lifecycle.manifest.yaml.source import parse
 ROOT = Path(__file__).parents[3]
 SCHEMA: Any = read_schema(MANIFEST)
 DEFS = SCHEMA["$defs"]
-RESOLVED = validator("", True)
+RESOLVED = validator()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "schemas").glob("*.json")), ids=lambda p: p.name)

@@ -29,7 +29,7 @@ machines:
   base: {address: 10.77.0.1}
   arm: {address: 10.77.0.2}
 discovery: {domain_id: 7}
-network: {five_qi_dscp: gsma_ir34}
+network: {max_datagram_bytes: 1400}
 nodes:
   talker:
     run: {python: "robot:Talker", working_directory: work, environment: {LEVEL: low}}

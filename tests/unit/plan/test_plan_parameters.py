@@ -19,7 +19,7 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.manifest.parameter_files import read_sections
+from lifecycle.manifest.parameter_files import read_parameter_file
 from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.model import Plan
 from lifecycle.plan.parameters import portable
@@ -175,9 +175,9 @@ def test_a_check_reads_each_file_once(tmp_path: Path, monkeypatch: pytest.Monkey
 
     def counted(path: str, *, shown: str) -> object:
         read.append(shown)
-        return read_sections(path, shown=shown)
+        return read_parameter_file(path, shown=shown)
 
-    monkeypatch.setattr("lifecycle.manifest.parameter_files.read_sections", counted)
+    monkeypatch.setattr("lifecycle.manifest.parameter_files.read_parameter_file", counted)
     (tmp_path / "p.yaml").write_text("/**: {ros__parameters: {rate: 1.0, use_sim_time: true}}")
     run = "{run: {command: [a]}, managed: false, endpoints: open, parameter_files: [p.yaml]}"
     path = tmp_path / "a.lifecycle.yaml"

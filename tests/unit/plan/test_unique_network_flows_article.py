@@ -10,14 +10,11 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.checks.registry import check
 from lifecycle.manifest.model import (
     EndpointKind,
-    FlowIdentification,
     Link,
     Machine,
     Manifest,
-    Network,
     UniqueHow,
 )
 from lifecycle.network.nfe import (
@@ -25,7 +22,6 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan.build import build_plan
-from lifecycle.plan.model import PlanError
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
@@ -205,57 +201,6 @@ def test_candidate_ipv6_flow_label_tells_two_equal_5_tuples_apart():
     assert verdict_of(system, *other).findings == ()
 
 
-def identified(count: int, **rest: object) -> Manifest:
-    """So many unique publishers in as many nodes, told apart by their DSCP."""
-    return manifest(
-        *(
-            node(
-                f"n{index}",
-                publisher("p", EMPTY),
-                needs=[need(PUB, "p", STRICTLY)],
-                namespace=f"/m{index}",
-                machine=f"m{index}",
-            )
-            for index in range(count)
-        ),
-        machines=tuple(
-            Machine(name=f"m{index}", address=f"10.0.0.{index + 1}", at=at(1))
-            for index in range(count)
-        ),
-        network=Network(flow_identification=FlowIdentification.DSCP),
-        positions={"network": at(2)},
-        **rest,
-    )
-
-
-# --- limitations
-
-
-def errors(system: Manifest) -> list[str]:
-    return [str(each) for each in check(system, environment={}) if each.severity.value == "error"]
-
-
-def test_limitation_64_publishers_have_64_dscp_values():
-    system = identified(64)
-    assert errors(system) == []
-    plan = build_plan(system, environment={})
-    assert sorted(each.dscp for each in (one.endpoints[0] for one in plan.nodes)) == list(range(64))
-    assert [len(each.participants) for each in plan.nodes] == [1] * 64
-
-
-def test_limitation_the_65th_publisher_is_refused_by_name():
-    system = identified(65)
-    message = (
-        "cannot give publisher 'p' of 'n64' a DSCP of its own: it is number 65 of 65 publishers "
-        "that need one, and a DSCP has 64 values"
-    )
-    hint = "use 'flow_identification: participant', or ask for fewer unique publishers"
-    assert errors(system) == [f"robot.lifecycle.yaml:20:1: {message}; {hint}"]
-    with pytest.raises(PlanError) as error:
-        build_plan(system, environment={})
-    assert (error.value.message, error.value.hint) == (message, hint)
-
-
 # --- alternative solutions
 
 
@@ -268,12 +213,3 @@ def test_alternative_1_dedicated_nodes_need_a_process_each_and_no_participants_o
     plan = build_plan(dedicated, environment={})
     assert [each.participants for each in plan.nodes] == [()] * 4
     assert len(plan.processes) == 4
-
-
-def test_alternative_2_a_6_tuple_by_dscp_gives_each_publisher_a_value_of_its_own():
-    plan = build_plan(identified(3), environment={})
-    values = [each.participants[0].dscp for each in plan.nodes]
-    assert values == [3, 7, 11]
-    assert plan.nodes[0].participants[0].reason == (
-        "unique publisher p marked DSCP 3 = TOS 12 (0x0c)"
-    )
