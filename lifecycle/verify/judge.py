@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, UniqueHow
 from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, is_ip
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
@@ -86,21 +86,18 @@ def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
 
 def _reported(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
     ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
-    source = uniqueness.nfes(flow.publishers)
-    destination = uniqueness.nfes(flow.subscriptions)
     carrier = effective_transport(flow)
     return FlowReport(
         topic=flow.planned.topic,
         publisher=flow.publisher,
         subscription=flow.subscription,
-        source=_used(source, carrier),
-        destination=_used(destination, carrier),
+        source=_used(uniqueness.nfes(flow.publishers), carrier),
+        destination=_used(uniqueness.nfes(flow.subscriptions), carrier),
         unique=None if None in ends else _HOW[ends.count(True)],
         dscp=_dscp(flow.publishers, carrier),
         reader_dscp=_dscp(flow.subscriptions, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
-        transport=_transport(flow, source, destination),
         outcome=_outcome(flow, spoiled),
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
@@ -130,29 +127,6 @@ def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
         return None
     read = {end.report.dscp if end.report else None for end in ends}
     return read.pop() if len(read) == 1 else None
-
-
-def _transport(
-    flow: FlowView,
-    source: Sequence[NetworkFlowEndpoint],
-    destination: Sequence[NetworkFlowEndpoint],
-) -> str:
-    """Return what can carry a flow: transports both ends list, shared memory on one machine only.
-
-    NFEs do not prove which of them carries the data, so several are joined by "or".
-    """
-    if not source or not destination:
-        return "unknown"
-    machines = {each.configuration.identity.machine_id for each in flow.nodes if each.configuration}
-    common: list[str] = []
-    if len(machines) == 1 and not all(map(is_ip, source)) and not all(map(is_ip, destination)):
-        common.append(Medium.SHM)
-    arriving = {(each.transport_protocol, each.internet_protocol) for each in destination}
-    for each in source:
-        place = (each.transport_protocol, each.internet_protocol)
-        if is_ip(each) and place in arriving and each.transport_protocol.value not in common:
-            common.append(each.transport_protocol.value)
-    return " or ".join(common) or "none"
 
 
 def verify(

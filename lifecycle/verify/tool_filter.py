@@ -20,14 +20,12 @@ import msgspec
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind, RosInterfaceAccess
 from lifecycle.manifest.names import (
-    ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MODE_SERVICE,
     NODE_SERVICES,
     OUR_SERVICES,
     SUPERVISOR_STATUS,
     SUPERVISORS,
-    supervisor_alive_topic,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
@@ -62,8 +60,6 @@ _DIAGNOSTICS_QOS = QosProfile(
 )
 """What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
-_ALIVE_TYPES = {"": "std_msgs/msg/String", ALIVE_PULSE: "std_msgs/msg/Empty"}
-"""Of the topics on which a supervisor asserts its liveliness, by the ends of their names."""
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
@@ -168,19 +164,14 @@ class DeclaredNames(msgspec.Struct, frozen=True):
         names: by the kind that offers, fully qualified, those that endpoints declare.
         of_supervisors: likewise, those that only supervisors of the plan may have, whatever
             `policy.ros_interface` says.
-        alive: names of the topics by which its supervisors assert their liveliness to each other.
         simulated: nodes of the plan have `use_sim_time`, so that it matters who publishes /clock.
-        diagnosed: the plan declares who reads /diagnostics, so that it must be known who are
-            supervisors, those of other systems too.
     """
 
     nodes: frozenset[str] = frozenset()
     ends: frozenset[tuple[str, EndpointKind, str]] = frozenset()
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
     of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
-    alive: frozenset[str] = frozenset()
     simulated: bool = False
-    diagnosed: bool = False
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
@@ -202,9 +193,7 @@ class DeclaredNames(msgspec.Struct, frozen=True):
             names=names,
             # A manifest may declare a node of its own that has them.
             of_supervisors=of_supervisors - names,
-            alive=frozenset(topic for topic, _ in _alive(plan)),
             simulated=any(map(uses_sim_time, plan.nodes)),
-            diagnosed=(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC) in names,
         )
 
     def of_kind(self, kind: EndpointKind) -> tuple[str, ...]:
@@ -235,9 +224,7 @@ class DeclaredNames(msgspec.Struct, frozen=True):
 
     def looks_for(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
-        if kind is EndpointKind.PUBLISHER and name in self.alive:
-            return True
-        return self.fed_by(kind, name) or (self.diagnosed and _is_status(kind, name))
+        return self.fed_by(kind, name) or _is_status(kind, name)
 
 
 _OWN: Mapping[EndpointKind, Collection[str]] = {
@@ -345,80 +332,55 @@ def of_supervisors(
 ) -> frozenset[ObservedEndpoint]:
     """Return those endpoints that supervisors offer as policies allow, of this or another system.
 
-    A name proves nothing: the participant that publishes a status topic, or asserts the liveliness
-    of a machine's supervisor, is that supervisor, if no other does; its services are of the same
-    node, and what it publishes on /diagnostics is of the same participant. Either may be seen late:
-    after an outage of a link they arrive one after the other.
+    A name proves nothing: who offers something below a supervisor's prefix is that supervisor if
+    no other participant does, and what it publishes on /diagnostics is of that participant.
 
     Args:
         plan: of the system that is judged.
         endpoints: of tools.
     """
-    ours = supervisor_prefixes(plan)
-    alive = _alive(plan)
-    found: list[ObservedEndpoint] = []
-    asserting: list[ObservedEndpoint] = []
-    claims: dict[str, set[_Claim]] = {}
+    ours, access = supervisor_prefixes(plan), plan.policy.access
+    prefixes = {
+        place: prefix for prefix in ours for place in _below(prefix, plan, RosInterfaceAccess.FULL)
+    }
+    allowed = {
+        place
+        for prefix in (() if access is RosInterfaceAccess.OFF else ours)
+        for place in _below(prefix, plan, access)
+    }
+    found: list[tuple[str, ObservedEndpoint]] = []
+    claims: dict[str, tuple[set[str], set[str]]] = {}
     for each in endpoints:
         if is_supervisor_endpoint(each.kind, each.node, each.name, each.type):
-            found.append(each)
-            if _is_status(each.kind, each.name):
-                claims.setdefault(each.name.rpartition("/")[0], set()).add(_claim(each))
-        elif _may_assert(each) and (prefix := alive.get((each.name, each.type))) is not None:
-            asserting.append(each)
-            claims.setdefault(prefix, set()).add(_claim(each))
-    access = plan.policy.access
-    known: dict[str, _Claim] = {}
-    services: set[tuple[str, EndpointKind, str]] = set()
-    for prefix, (claim, *others) in claims.items():
-        if others or (prefix in ours and access is RosInterfaceAccess.OFF):
-            continue
-        known[prefix] = claim
-        if prefix in ours:
-            services |= {(claim[0], *each) for each in _below(prefix, plan, access)}
-    participants = set(known.values())
-    diagnoses = takes_diagnostics(plan)
-    allowed = [
-        each
-        for each in found
-        if (
-            _is_status(each.kind, each.name)
-            and known.get(each.name.rpartition("/")[0]) == _claim(each)
-        )
-        or (not each.kind.is_topic and (each.node, each.kind, each.name) in services)
-        or (each.name == DIAGNOSTICS_TOPIC and diagnoses and _claim(each) in participants)
-    ]
-    return frozenset((*allowed, *asserting))
-
-
-_Claim = tuple[str, str]
-"""A node's name and the GUID prefix of its participant."""
-
-
-def _claim(endpoint: ObservedEndpoint) -> _Claim:
-    return endpoint.node, endpoint.gid[:PREFIX_DIGITS]
-
-
-def _alive(plan: Plan) -> dict[tuple[str, str], str]:
-    """Return the topics by which supervisors of a plan assert their liveliness, each with its type.
-
-    Returns:
-        The prefix of the supervisor, see `supervisor_prefix`, by name and type.
-    """
-    machines = {each.machine for each in plan.nodes}
-    return {
-        (supervisor_alive_topic(plan.system, machine) + end, type_): supervisor_prefix(
-            plan.system, machine
-        )
-        for machine in (machines if len(machines) > 1 else ())
-        if machine
-        for end, type_ in _ALIVE_TYPES.items()
+            prefix = prefixes.get((each.kind, each.name), each.name.rpartition("/")[0])
+            found.append((prefix, each))
+            nodes, participants = claims.setdefault(prefix, (set(), set()))
+            nodes.add(each.node)
+            participants.update((each.gid[:PREFIX_DIGITS],) if each.gid else ())
+    believed = {
+        prefix: participants
+        for prefix, (nodes, participants) in claims.items()
+        if prefix and len(nodes) == 1 and len(participants) <= 1
     }
-
-
-def _may_assert(endpoint: ObservedEndpoint) -> bool:
-    """Return whether an endpoint may be one by which a supervisor asserts its liveliness."""
-    return endpoint.kind is EndpointKind.PUBLISHER and _is_observer(endpoint.node)
+    diagnosing = {
+        each
+        for prefix, found in believed.items()
+        if prefix not in ours or access is not RosInterfaceAccess.OFF
+        for each in found
+    }
+    return frozenset(
+        each
+        for prefix, each in found
+        if (
+            takes_diagnostics(plan) and each.gid[:PREFIX_DIGITS] in diagnosing
+            if each.name == DIAGNOSTICS_TOPIC
+            else prefix in believed
+            and (
+                (each.kind, each.name) in allowed
+                or (prefix not in ours and _is_status(each.kind, each.name))
+            )
+        )
+    )
 
 
 def _is_observer(full_name: str) -> bool:
@@ -545,9 +507,9 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
     """Replace complete sets of an action's hidden endpoints by one action endpoint.
 
     A server is complete with three services and two publishers, a client with three service
-    clients and two subscriptions. Parts of an incomplete action stay as they are: an action that
-    discovery shows only half of is not there yet. So do those of another type than their action's,
-    and those of a server that are there once more. Action endpoints in the input stay.
+    clients and two subscriptions, all of the action's types. Other parts stay as they are: an
+    action that discovery shows only half of is not there yet. A client that a node has several
+    times is one end. Action endpoints in the input stay.
     """
     kept: list[ObservedEndpoint] = []
     groups: dict[tuple[str, EndpointKind, str], list[ObservedEndpoint]] = {}
@@ -559,20 +521,21 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
             groups.setdefault((endpoint.node, *action), []).append(endpoint)
     known = {(each.node, each.kind, each.name) for each in kept}
     for (node, side, name), parts in groups.items():
-        named: dict[str, list[ObservedEndpoint]] = {}
-        for each in parts:
-            named.setdefault(each.name.rpartition("/")[2], []).append(each)
-        type_ = _action_type(named)
-        left = list(parts)
-        if (node, side, name) in known and side is EndpointKind.ACTION_CLIENT:
-            continue  # one that a node has several times is one end
-        while named.keys() == _ACTION_PARTS.keys():
-            # What has another type makes the action complete, and is left over.
-            chosen = {
-                part: next((e for e in found if e.type == part_type(part, type_)), found[0])
-                for part, found in named.items()
-            }
-            goals = chosen["send_goal"]
+        calls = side is EndpointKind.ACTION_CLIENT
+        if calls and (node, side, name) in known:
+            continue
+        type_ = _action_type(parts)
+        named = {
+            part: [
+                each
+                for each in parts
+                if (each.name, each.type) == (f"{name}{_ACTION_PART}{part}", part_type(part, type_))
+            ]
+            for part in _ACTION_PARTS
+        }
+        count = min(map(len, named.values()))
+        for chosen in list(zip(*named.values(), strict=False))[: 1 if calls else count]:
+            goals = chosen[0]
             kept.append(
                 ObservedEndpoint(
                     kind=side,
@@ -581,19 +544,15 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
                     type=type_,
                     gid=goals.gid,
                     address=goals.address,
-                    type_hash=_action_hash(chosen),
+                    type_hash=_action_hash(dict(zip(named, chosen, strict=True))),
                 )
             )
-            serves = side is EndpointKind.ACTION_SERVER
-            for part, each in chosen.items():
-                taken = [each] if serves else [e for e in named[part] if e.type == each.type]
-                right = each.type == part_type(part, type_)
-                for one in taken:
-                    named[part].remove(one)
-                    if right:
-                        left.remove(one)
-            named = {part: found for part, found in named.items() if found}
-        kept.extend(left)
+        folded = {
+            id(each)
+            for found in named.values()
+            for each in (found if calls and count else found[:count])
+        }
+        kept.extend(each for each in parts if id(each) not in folded)
     return tuple(kept)
 
 
@@ -608,15 +567,13 @@ def part_type(part: str, type_: str) -> str:
     return f"{type_}{end}" if end.startswith("_") else end
 
 
-def _action_type(parts: Mapping[str, Iterable[ObservedEndpoint]]) -> str:
-    """Return the type of an action: that of most of its parts, of its goals where they differ."""
-    found = [
-        each.type.removesuffix(end)
-        for part, (_, end) in _ACTION_PARTS.items()
-        if end.startswith("_")
-        for each in parts.get(part, ())
-        if each.type.endswith(end)
-    ]
+def _action_type(parts: Iterable[ObservedEndpoint]) -> str:
+    """Return the type of an action: that of most of its parts where they differ."""
+    found = []
+    for each in parts:
+        _, end = _ACTION_PARTS[each.name.rpartition("/")[2]]
+        if end.startswith("_") and each.type.endswith(end):
+            found.append(each.type.removesuffix(end))
     return max(found, key=found.count) if found else ""
 
 

@@ -214,14 +214,12 @@ def test_parts_of_two_nodes_do_not_make_one_action():
     assert sorted(fold_actions(mixed), key=str) == sorted(mixed, key=str)
 
 
-def test_parts_of_another_type_stay_beside_their_action():
+def test_parts_of_another_type_make_no_action_and_stay_beside_one() -> None:
     some = parts()
     wrong = [replace(each, type="std_msgs/msg/String") for each in some[-2:]]
-    action, *left = fold_actions([*some[:-2], *wrong])
+    assert fold_actions([*some[:-2], *wrong]) == (*some[:-2], *wrong)
+    action, *left = fold_actions([*some, *wrong])
     assert (action.type, left) == ("robot/action/Dock", wrong)
-    none_right = [replace(each, type="std_msgs/msg/String") for each in some]
-    action, *left = fold_actions(none_right)
-    assert (action.type, left) == ("", none_right)
 
 
 def test_parts_of_an_action_client_that_is_there_already_are_no_second_one():

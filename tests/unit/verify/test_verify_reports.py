@@ -127,7 +127,6 @@ WRITTEN = Verdict(
                 UniqueRequirement.STRICTLY_REQUIRED,
             ),
             demanded=UniqueHow.NOT,
-            transport="unknown",
             outcome=Outcome.UNVERIFIABLE,
             effective_transport="shm",
         ),
@@ -305,7 +304,7 @@ def test_the_json_of_a_verdict_on_one_line_is_spelled_so():
         '"node":"","endpoint":null,"hint":""}],'
         '"flows":[{"topic":"/a","publisher":"/one","subscription":"/two","source":[],'
         '"destination":[],"unique":null,"dscp":null,"requirement":["optionally_required","strictly_required"],"demanded":"not",'
-        '"transport":"unknown","outcome":"unverifiable","max_delay_ms":null,"five_qi":null,'
+        '"outcome":"unverifiable","max_delay_ms":null,"five_qi":null,'
         '"five_qi_reason":"","effective_transport":"shm","reader_dscp":null,"tuples":[]}],'
         '"open_endpoints":['
         '{"kind":"publishers","node":"/open","name":"/extra","type":"std_msgs/msg/String"},'
