@@ -72,9 +72,6 @@ UNREPORTED_FLOW = Rule(
     fix="run one of its nodes in our host (`run: python`), or write it under `policy.trust`",
     heals=Heals.WITH_TIME,
 )
-RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW)
-
-
 Match = tuple[Outcome, str]
 """What is known of a pair, and why it is not ok."""
 
@@ -136,7 +133,7 @@ def match(
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every planned flow, then every end that reports how many peers it has."""
+    """Judge every planned flow, every end that reports how many peers it has, every client."""
     topics: dict[str, _Ends] = {}
     for each in (*view.seen, *view.seen_of_tools):
         publishers, subscriptions = topics.setdefault(each.name, ([], []))
@@ -145,6 +142,7 @@ def check(view: View) -> Iterator[Finding]:
         yield from _judge_flow(flow, topics.get(flow.planned.topic, _NO_ENDS))
     yield from _unknown_peers(view, topics)
     yield from _unreported_flows(view)
+    yield from _clients(view)
 
 
 def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]:
@@ -226,16 +224,14 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
     violated = outcome is Outcome.VIOLATED
     pair = f"{flow.publisher} → {flow.subscription}"
-    yield rule.finding(
+    yield rule.on(
+        flow,
         outcome=outcome,
-        subject=flow.subject,
-        ends=flow.ends,
         expected="matched",
         observed=reason,
         message=f"{pair} are not matched on {flow.planned.topic}: {reason}"
         if violated
         else f"nothing proves that {pair} are matched on {flow.planned.topic}: {reason}",
-        at=flow.at,
     )
 
 
@@ -314,7 +310,7 @@ UNMATCHED_CLIENT = Rule(
     if_undiscovered=True,
     absence="match",
 )
-CLIENT_RULES = (UNMATCHED_CLIENT,)
+RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW, UNMATCHED_CLIENT)
 
 _Place = tuple[EndpointKind, str, str]
 """Kind, name and type."""
@@ -326,7 +322,7 @@ SERVER_OF = {
 _SERVERS = frozenset(SERVER_OF.values())
 
 
-def check_clients(view: View) -> Iterator[Finding]:
+def _clients(view: View) -> Iterator[Finding]:
     """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
     for actual in view.actual:
