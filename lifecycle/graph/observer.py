@@ -159,7 +159,7 @@ class Observer:
         names = DeclaredNames.of(plan)
         while True:
             self._changed.clear()
-            nodes, endpoints = self.discovery.snapshot(declared=planned, names=names)
+            nodes, endpoints = self.discovery.snapshot(names=names)
             settling_s = self.discovery.settling.left_s()
             if settling_s <= 0:
                 break

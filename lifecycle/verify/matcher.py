@@ -175,7 +175,7 @@ def _attributed(
         ours = (owner.node if owner is not None else node) in configurations
         for each in endpoints:
             whose = owner.node if owner is not None and owner.has(each) else node
-            if _counts(each, whose, names, ours=ours):
+            if names.keeps(each, whose, ours=ours):
                 by_node.setdefault(whose, []).append(_as_of(each, whose))
     return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
 
@@ -210,17 +210,6 @@ def _unknown(
         # Half of a service may be seen before its node is: it is no second one.
         known = node and not endpoint.kind.is_topic
         yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
-
-
-def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours: bool) -> bool:
-    """Return whether an endpoint of a node is declared, feeds what is, or was made on purpose."""
-    return (
-        (node, endpoint.kind, endpoint.name) in names.ends
-        or (node not in names.nodes and names.looks_for(endpoint.kind, endpoint.name))
-        or not is_noise_endpoint(
-            endpoint.kind, endpoint.node, endpoint.name, endpoint.type, ours=ours
-        )
-    )
 
 
 def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:

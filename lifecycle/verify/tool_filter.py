@@ -226,6 +226,21 @@ class DeclaredNames(msgspec.Struct, frozen=True):
         """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
         return self.fed_by(kind, name) or _is_status(kind, name)
 
+    def keeps(self, endpoint: ObservedEndpoint, node: str, *, ours: bool) -> bool:
+        """Return whether an endpoint is declared, feeds what is, or was made on purpose.
+
+        Args:
+            endpoint: as discovery shows it.
+            node: full name of the node whose it is.
+            ours: see `is_noise_endpoint`.
+        """
+        kind, name = endpoint.kind, endpoint.name
+        return (
+            (node, kind, name) in self.ends
+            or (node not in self.nodes and self.looks_for(kind, name))
+            or not is_noise_endpoint(kind, endpoint.node, name, endpoint.type, ours=ours)
+        )
+
 
 _OWN: Mapping[EndpointKind, Collection[str]] = {
     EndpointKind.SERVICE_SERVER: NODE_SERVICES.keys() | OUR_SERVICES.keys(),
@@ -467,19 +482,13 @@ def without_noise(
 
     Args:
         endpoints: to choose from.
-        but: names that are looked for: endpoints of them are kept, whatever they look like.
+        but: names that are looked for.
         ours: names of the nodes that are ours; None for `our_nodes` of these endpoints.
     """
     found = tuple(endpoints)
     if ours is None:
         ours = our_nodes(found)
-    return tuple(
-        each
-        for each in found
-        if (each.node, each.kind, each.name) in but.ends
-        or but.looks_for(each.kind, each.name)
-        or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
-    )
+    return tuple(each for each in found if but.keeps(each, each.node, ours=each.node in ours))
 
 
 def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | None:

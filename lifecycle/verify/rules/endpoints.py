@@ -164,8 +164,8 @@ def _undeclared(view: View) -> Iterator[Finding]:
             and each.planned.type == endpoint.type
             and each.observed is None
         ]
-        hint = _given_name(view, endpoint)
-        if not hint and len(similar) == 1:
+        hint = ""
+        if len(similar) == 1:
             hint = f"{similar[0].resolved} of the same type is missing: is a remap or a name wrong?"
         yield UNDECLARED[endpoint.kind].finding(
             subject=endpoint.name,
@@ -200,20 +200,6 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
                 f" {endpoint.type or 'of unknown type'}",
             )
     return None
-
-
-def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
-    """Explain a name that a declared endpoint was given while it ran; empty if it was not."""
-    for actual in view.nodes[endpoint.node].actual:
-        report = actual.report
-        if report is None or report.kind is not endpoint.kind:
-            continue
-        if endpoint.name == report.resolved != actual.planned.resolved:
-            return (
-                f"it is {report.kind.value}/{report.name} under another name: is a remap wrong, or"
-                f" was {endpoint.node}/remap called?"
-            )
-    return ""
 
 
 def _conflicts(view: View) -> Iterator[Finding]:

@@ -516,8 +516,10 @@ def test_the_junit_of_a_manifest_and_of_a_run_is_spelled_so():
     )
     assert text.endswith("\n  </testsuite>\n</testsuites>\n")
     assert suite(text, "manifest").splitlines()[2:] == [
-        ("""<failure message="cannot use key 'nmae'">violated manifest.unknown-key:"""
-        " nodes.camera.nmae"),
+        (
+            """<failure message="cannot use key 'nmae'">violated manifest.unknown-key:"""
+            " nodes.camera.nmae"
+        ),
         "cannot use key 'nmae'",
         "at        robot.lifecycle.yaml:4:5",
         *("</failure>", "</testcase>", "</testsuite>"),
