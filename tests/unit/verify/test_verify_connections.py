@@ -95,11 +95,6 @@ def findings(edit: Edit, plan: Plan = PLAN, **how: object) -> list[tuple[str, st
     return [(each.rule, each.outcome.value, each.subject) for each in verdict.findings]
 
 
-def message(edit: Edit, plan: Plan = PLAN) -> str:
-    (finding,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
-    return finding.message
-
-
 def reported(*urls: str, name: str = "net", error: str = "") -> Edit:
     report = ConnectionReport(name=name, urls=urls, node_name="_camera_net", error=error)
     return change_configuration("/camera", connections=(report,))
@@ -425,12 +420,6 @@ def test_a_negotiated_medium_is_held_to(medium: str, outcome: str | None) -> Non
 def test_a_medium_that_nobody_tells_is_unverifiable() -> None:
     unknown = both(change_report(PUB, "/video", nfes=None), change_report(SUB, "/video", nfes=None))
     assert ("flow.wrong-medium", "unverifiable", FLOW) in findings(unknown, plan_of(medium="udpv4"))
-
-
-def test_the_message_says_both_media() -> None:
-    assert message(WITH_UDP, plan_of(medium="shm")) == (
-        "what carries /camera → /viewer on /video must be shared memory, and is udpv4"
-    )
 
 
 def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
