@@ -30,15 +30,6 @@ from lifecycle.manifest.names import (
     supervisor_services,
     supervisor_status_topic,
 )
-from lifecycle.manifest.qos import (
-    Certainty,
-    Durability,
-    History,
-    Liveliness,
-    QosProfile,
-    Reliability,
-    incompatibilities,
-)
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan, uses_sim_time
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
@@ -51,14 +42,6 @@ _OUR_TOPICS = "/_lifecycle/"
 """Where the supervisors of several machines notice each other."""
 
 _DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
-_DIAGNOSTICS_QOS = QosProfile(
-    history=History.KEEP_LAST,
-    depth=10,
-    reliability=Reliability.RELIABLE,
-    durability=Durability.VOLATILE,
-    liveliness=Liveliness.AUTOMATIC,
-)
-"""What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
@@ -311,9 +294,9 @@ def _below(
 def takes_diagnostics(plan: Plan) -> bool:
     """Return whether a supervisor may publish on /diagnostics and disturb nothing of the plan.
 
-    It may not where the manifest has the name for something else, where its publisher would be of
-    no use to a declared subscription, and where the manifest says what flow the topic must have:
-    what the supervisor sent to the same port would be part of what was verified and programmed.
+    It may not where the manifest has the name for something else, and where it says what flow the
+    topic must have: what the supervisor sent to the same port would be part of what was verified
+    and programmed.
     """
     ends = [
         each for node in plan.nodes for each in node.endpoints if each.resolved == DIAGNOSTICS_TOPIC
@@ -324,14 +307,6 @@ def takes_diagnostics(plan: Plan) -> bool:
         and each.unique in free
         and each.dscp is None
         and each.five_qi is None
-        and (
-            each.kind is not EndpointKind.SUBSCRIPTION
-            or each.qos is None
-            or all(
-                found.severity is not Certainty.CERTAIN
-                for found in incompatibilities(_DIAGNOSTICS_QOS, each.qos)
-            )
-        )
         for each in ends
     )
 

@@ -13,7 +13,7 @@ from lifecycle.manifest.model import (
     Policy,
     RosInterfaceAccess,
 )
-from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import with_findings, without_findings
 from lifecycle.verify.outcome import Outcome
@@ -121,7 +121,6 @@ def test_tools_are_listed_with_what_they_have_and_the_pattern_that_tolerates_the
 
 
 ARRAY, TRIGGER = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
-SYSTEM_DEFAULT = Liveliness.SYSTEM_DEFAULT
 ONE_PARTICIPANT = "10000000000000000000000a"
 
 
@@ -239,15 +238,8 @@ def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> 
     ("end", "publishes"),
     [
         (subscription("/diagnostics", ARRAY), True),
-        (subscription("/diagnostics", ARRAY, qos=QosProfile(liveliness=SYSTEM_DEFAULT)), True),
         (publisher("/diagnostics", ARRAY), True),
         (subscription("/diagnostics", "my_msgs/msg/Diagnostics"), False),
-        (
-            subscription(
-                "/diagnostics", ARRAY, qos=QosProfile(durability=Durability.TRANSIENT_LOCAL)
-            ),
-            False,
-        ),
     ],
 )
 def test_a_supervisor_does_not_publish_diagnostics_where_it_would_disturb(

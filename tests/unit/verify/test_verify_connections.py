@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import msgspec
 import pytest
 from msgspec.structs import replace
@@ -22,7 +20,6 @@ from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, 
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
-from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Finding, OpenEndpoint, Stage
 from tests.builders import at, link, nfe, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
@@ -34,6 +31,7 @@ from tests.unit.verify.edits import (
     drop_endpoint,
     drop_node,
     drop_report,
+    unchanged,
 )
 from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
@@ -84,10 +82,6 @@ def plan_of(*, medium: str = "", linked: bool = False, run: Run | None = None) -
 
 
 PLAN = plan_of()
-
-
-def unchanged(seen):
-    return seen
 
 
 def findings(edit: Edit, plan: Plan = PLAN, **how: object) -> list[tuple[str, str, str]]:
@@ -439,13 +433,6 @@ def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:
     assert verdict.open_endpoints == (
         OpenEndpoint(kind=PUB, node="/camera", name="/news", type="std_msgs/msg/String"),
     )
-    assert json.loads(to_json(verdict))["open_endpoints"] == [
-        {"kind": "publishers", "node": "/camera", "name": "/news", "type": "std_msgs/msg/String"}
-    ]
-    assert (
-        "endpoints that `endpoints: open` allows\n"
-        "  publisher of /news in /camera, std_msgs/msg/String\n"
-    ) in render_text(verdict)
     closed = verify(
         PLAN, add_endpoint(PUB, "/camera", "/news")(perfect(PLAN)), stage=Stage.CONNECTED
     )

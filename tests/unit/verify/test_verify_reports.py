@@ -48,6 +48,7 @@ from tests.unit.verify.edits import (
     drop_endpoint,
     drop_node,
     drop_report,
+    unchanged,
 )
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
@@ -61,17 +62,13 @@ def after(edit: Edit) -> Verdict:
     return verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
 
 
-def perfectly(seen):
-    return seen
-
-
 BAD = both(
     change_reported_qos(SUB, "/robot/status", depth=1),
     change_report(PUB, "/robot/battery", dscp=None),
 )
 NOT_DECLARED = add_node("/spy<&>\x07")
 EDITS = {
-    "ok": perfectly,
+    "ok": unchanged,
     "bad": BAD,
     "undeclared": NOT_DECLARED,
     "gone": both(drop_node("/viewer"), drop_report("/robot/camera")),
@@ -155,7 +152,7 @@ WRITTEN = Verdict(
 
 
 def test_a_good_verdict_is_one_line_and_its_flows_with_the_tuples_that_carry_them():
-    lines = render_text(after(perfectly)).splitlines()
+    lines = render_text(after(unchanged)).splitlines()
     assert lines[:3] == ["verdict: ok (3 flows)", "", "flows"]
     pair, video, battery = (
         "/robot/camera → /viewer",
@@ -173,7 +170,7 @@ def test_a_good_verdict_is_one_line_and_its_flows_with_the_tuples_that_carry_the
 
 
 def with_first_flow(**changes: object) -> Verdict:
-    verdict = after(perfectly)
+    verdict = after(unchanged)
     flow = replace(verdict.flows[0], **changes)
     return replace(verdict, flows=(flow,))
 
@@ -415,7 +412,7 @@ INVALID = replace(
 
 
 def test_test_cases_have_the_same_names_whatever_the_outcome():
-    names = list(cases(after(perfectly)))
+    names = list(cases(after(unchanged)))
     for edit in EDITS.values():
         assert list(cases(after(edit))) == names
     assert list(cases(UNJUDGED)) == names
@@ -488,7 +485,7 @@ def test_what_may_not_block_is_refused_by_who_is_strict_alone(
 
 def test_what_was_judged_before_a_run_failed_is_not_skipped():
     run = RunEnd(reason="failed: /camera (run.process-died)", reached="active", exit_code=6)
-    came = cases(replace(after(perfectly), run=run))
+    came = cases(replace(after(unchanged), run=run))
     assert {name for name, each in came.items() if each != "passed"} == {"run/end"}
 
 
@@ -538,7 +535,7 @@ def test_the_junit_of_a_manifest_and_of_a_run_is_spelled_so():
 
 def test_the_junit_of_a_run_that_did_what_was_asked_for_says_how_it_ended():
     done = RunEnd(reason="done", reached="active", exit_code=0)
-    text = to_junit(replace(after(perfectly), run=done), PLAN)
+    text = to_junit(replace(after(unchanged), run=done), PLAN)
     assert suite(text, "run").splitlines()[-5:] == [
         '<testcase classname="run" name="end">',
         "<system-out>ended after it was active, exit code 0: done",
