@@ -306,33 +306,23 @@ def missing(verdict: Verdict) -> str:
     findings = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if not findings and verdict.blocking:
         findings = list(verdict.findings)
-    absent: list[str] = []
-    wrong: list[str] = []
-    unknown: list[str] = []
+    named: dict[str, dict[str, None]] = {"missing": {}, "wrong": {}, "unknown": {}}
     broken = {each.rule for each in findings}
     for finding in findings:
         kind = rule(finding.rule)
-        named = f"{finding.subject} ({finding.rule})"
+        it = f"{finding.subject} ({finding.rule})"
         if kind.absence and finding.outcome is Outcome.VIOLATED:
             what = finding.endpoint.noun if finding.endpoint else ""
             phrase = kind.absence.format(kind=what, node=finding.node)
-            absent.append(f"{finding.subject} ({phrase})")
+            named["missing"][f"{finding.subject} ({phrase})"] = None
         elif kind.awaits is not None:
             # While what would show it is missing, that is what is waited for.
             if kind.awaits.id not in broken:
-                unknown.append(named)
-        elif finding.outcome is Outcome.UNVERIFIABLE:
-            unknown.append(named)
+                named["unknown"][it] = None
         else:
-            wrong.append(named)
-    parts = []
-    if absent:
-        parts.append("missing: " + ", ".join(dict.fromkeys(absent)))
-    if wrong:
-        parts.append("wrong: " + ", ".join(dict.fromkeys(wrong)))
-    if unknown:
-        parts.append("unknown: " + ", ".join(dict.fromkeys(unknown)))
-    return "; ".join(parts)
+            is_known = finding.outcome is Outcome.VIOLATED
+            named["wrong" if is_known else "unknown"][it] = None
+    return "; ".join(f"{word}: {', '.join(each)}" for word, each in named.items() if each)
 
 
 def not_ok(verdict: Verdict) -> str:

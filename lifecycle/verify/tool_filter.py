@@ -116,12 +116,6 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     return ""
 
 
-@functools.lru_cache(maxsize=1 << 12)
-def is_noise_node(full_name: str) -> bool:
-    """Return whether a node is named as a tool that any user may be expected to run."""
-    return bool(tolerating_pattern(full_name))
-
-
 def matches(name: str, pattern: str) -> bool:
     """Return whether a name is as a pattern of a manifest has it: `*`, `?`, all else as it is."""
     return _compiled(pattern).fullmatch(name) is not None
@@ -445,25 +439,6 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
         ):
             offered.setdefault(each.node, set()).add(base)
     return frozenset(node for node, bases in offered.items() if bases >= OURS_BY)
-
-
-def without_noise(
-    endpoints: Iterable[ObservedEndpoint],
-    *,
-    but: DeclaredNames = NO_NAMES,
-    ours: Collection[str] | None = None,
-) -> tuple[ObservedEndpoint, ...]:
-    """Return what was written on purpose, in order; the input must be complete per node.
-
-    Args:
-        endpoints: to choose from.
-        but: names that are looked for.
-        ours: names of the nodes that are ours; None for `our_nodes` of these endpoints.
-    """
-    found = tuple(endpoints)
-    if ours is None:
-        ours = our_nodes(found)
-    return tuple(each for each in found if but.keeps(each, each.node, ours=each.node in ours))
 
 
 def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | None:

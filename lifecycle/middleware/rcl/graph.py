@@ -61,7 +61,6 @@ from lifecycle.verify.tool_filter import (
     DeclaredNames,
     fold_actions,
     our_nodes,
-    without_noise,
 )
 
 if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
@@ -239,7 +238,11 @@ class GraphObserver:
         self._ours = self._ours.intersection(shown).union(*map(our_nodes, shown.values()))
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
-            judged = without_noise(shown[name], but=names, ours=self._ours)
+            judged = tuple(
+                each
+                for each in shown[name]
+                if names.keeps(each, each.node, ours=each.node in self._ours)
+            )
             folded = fold_actions(self._hashed(name, judged, ends))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)

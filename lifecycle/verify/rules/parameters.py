@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Position
@@ -143,23 +144,24 @@ def _judge(
     node: PlannedNode, expected: ExpectedParameter, actual: ParameterReport | None
 ) -> Iterator[Finding]:
     what = f"parameter {expected.name} of node {node.full_name}"
+    place: dict[str, Any] = {
+        "subject": f"{node.full_name}: {expected.name}",
+        "at": expected.at,
+        "node": node.full_name,
+    }
     if actual is None:
         if not expected.optional:
-            yield _finding(
-                MISSING,
-                node,
-                expected,
-                wanted=_wanted(expected),
+            yield MISSING.finding(
+                **place,
+                expected=_wanted(expected),
                 observed="no such parameter",
                 message=f"there is no {what}, which is {_origin(expected)}",
             )
         return
     if not _is_of_type(actual, expected.type):
-        yield _finding(
-            TYPE_DIFFERS,
-            node,
-            expected,
-            wanted=expected.type,
+        yield TYPE_DIFFERS.finding(
+            **place,
+            expected=expected.type,
             observed=actual.type or "not set",
             message=f"{what} is {_with_type(actual)}, and must be "
             f"{expected.type} as {_origin(expected)}",
@@ -169,21 +171,17 @@ def _judge(
         hint = ""
         if expected.source == DEFAULT:
             hint = "give the value that is meant under `parameters`, or correct the default"
-        yield _finding(
-            VALUE_DIFFERS,
-            node,
-            expected,
-            wanted=wanted,
+        yield VALUE_DIFFERS.finding(
+            **place,
+            expected=wanted,
             observed=_value_of(actual),
             message=f"{what} is {_value_of(actual)}, and must be {wanted} as {_origin(expected)}",
             hint=hint,
         )
     if expected.read_only and not actual.read_only:
-        yield _finding(
-            READ_ONLY_DIFFERS,
-            node,
-            expected,
-            wanted="read_only",
+        yield READ_ONLY_DIFFERS.finding(
+            **place,
+            expected="read_only",
             observed="can be set",
             message=f"{what} can be set, and must be read_only as its interface declares it",
         )
@@ -204,27 +202,6 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
             observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
             message=f"the interface of node {node.full_name} does not declare {_listed(names)}",
         )
-
-
-def _finding(
-    rule: Rule,
-    node: PlannedNode,
-    expected: ExpectedParameter,
-    *,
-    wanted: str,
-    observed: str,
-    message: str,
-    hint: str = "",
-) -> Finding:
-    return rule.finding(
-        subject=f"{node.full_name}: {expected.name}",
-        expected=wanted,
-        observed=observed,
-        message=message,
-        at=expected.at,
-        node=node.full_name,
-        hint=hint,
-    )
 
 
 def _unknown(node: PlannedNode, why: str) -> Finding:
