@@ -42,8 +42,8 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         id: `family.name`, stable for ever; a section of docs/rules.md.
         meaning: what a finding of it says, one line.
-        outcomes: the outcomes that it can have besides ok.
         fix: what to do about it, one line.
+        outcomes: the outcomes that it can have besides ok.
         concerns_flow: a finding on an endpoint also spoils the flows of that endpoint.
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
@@ -61,8 +61,8 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     id: str
     meaning: str
-    outcomes: tuple[Outcome, ...]
     fix: str
+    outcomes: tuple[Outcome, ...] = (Outcome.VIOLATED,)
     concerns_flow: bool = False
     may_block: bool = True
     heals: Heals = Heals.WITH_CHANGE

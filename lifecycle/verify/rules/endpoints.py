@@ -22,7 +22,6 @@ from lifecycle.verify.view import Actual, SeenEndpoint, View
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
     meaning="a declared endpoint is not in the graph",
-    outcomes=(Outcome.VIOLATED,),
     fix="compare the declared name, remaps and namespace with what the node creates",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
@@ -32,14 +31,12 @@ MISSING_ENDPOINT = Rule(
 TYPE_MISMATCH = Rule(
     id="graph.type-mismatch",
     meaning="an endpoint has another type than declared, or than others of its name",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the type in the manifest or in the node; DDS never matches two types",
     concerns_flow=True,
 )
 ENDPOINT_ERROR = Rule(
     id="endpoint.error",
     meaning="a node reports that it could not make an endpoint as asked",
-    outcomes=(Outcome.VIOLATED,),
     fix="read the reason: it is the middleware's own",
     concerns_flow=True,
 )
@@ -58,7 +55,6 @@ UNDECLARED = {
         meaning=f"a declared node has {'an' if kind.noun.startswith('a') else 'a'} {kind.noun}"
         " that the manifest does not declare"
         + (", or a tool has one under a declared name" if kind.offers else ""),
-        outcomes=(Outcome.VIOLATED,),
         fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
     )
     for kind in EndpointKind

@@ -39,7 +39,6 @@ from lifecycle.verify.view import Actual, FlowView, View, connection_of
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
     meaning="an endpoint or a link needs a unique network flow and does not have it",
-    outcomes=(Outcome.VIOLATED,),
     fix="ask for `unique:` on the endpoint itself, so that it gets sockets of its own; see"
     " `lifecycle flows`",
     concerns_flow=True,
@@ -47,7 +46,6 @@ NOT_UNIQUE = Rule(
 UNVERIFIABLE = Rule(
     id="flow.unverifiable",
     meaning="a unique network flow is strictly required or demanded and cannot be proven",
-    outcomes=(Outcome.VIOLATED,),
     fix="run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
     " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`",
     concerns_flow=True,
@@ -57,7 +55,6 @@ UNVERIFIABLE = Rule(
 BROKEN_ENDPOINT = Rule(
     id="flow.broken-endpoint",
     meaning="a subscription has no network flow endpoint at all, so nothing can reach it",
-    outcomes=(Outcome.VIOLATED,),
     fix="look for two processes with the same fixed ports, or an interface whitelist that matches"
     " no interface",
     concerns_flow=True,

@@ -15,6 +15,7 @@ reports nothing about its clients.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -34,32 +35,30 @@ from lifecycle.verify.view import (
     brings_up,
 )
 
-UNMATCHED_LINK = Rule(
-    id="graph.unmatched-link",
-    meaning="the two ends of a declared link are not matched",
+_rule = functools.partial(
+    Rule,
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
-    fix="see the other findings on its ends; if there are none, look at the network between them",
-    concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
     absence="match",
 )
-UNMATCHED_FLOW = Rule(
+
+UNMATCHED_LINK = _rule(
+    id="graph.unmatched-link",
+    meaning="the two ends of a declared link are not matched",
+    fix="see the other findings on its ends; if there are none, look at the network between them",
+    concerns_flow=True,
+)
+UNMATCHED_FLOW = _rule(
     id="graph.unmatched-flow",
     meaning="a declared publisher and a declared subscription of its topic are not matched",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the network between the two: discovery range, multicast, firewall, peers",
     concerns_flow=True,
-    about=About.MATCH,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
-    absence="match",
 )
 UNKNOWN_PEER = Rule(
     id="graph.unknown-peer",
     meaning="a declared endpoint is matched with more peers than the graph shows",
-    outcomes=(Outcome.VIOLATED,),
     fix="look for a participant that is found by the node's addresses alone (initial peers, a"
     " discovery server) and not by the supervisor; give the system a domain of its own",
     concerns_flow=True,
@@ -300,15 +299,10 @@ def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEnd
     ]
 
 
-UNMATCHED_CLIENT = Rule(
+UNMATCHED_CLIENT = _rule(
     id="graph.unmatched-client",
     meaning="a declared client and a declared server of its service or action are not matched",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the QoS of both ends, and at the network between the two",
-    about=About.MATCH,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
-    absence="match",
 )
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW, UNMATCHED_CLIENT)
 

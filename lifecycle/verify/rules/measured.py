@@ -36,7 +36,7 @@ PROBATION_S = 10.0
 _FIVE_QI_QUANTILE = 0.98
 _DELAYS = frozenset({Kind.DELAY, Kind.NETWORK_DELAY})
 
-_rule = functools.partial(Rule, outcomes=(Outcome.VIOLATED,), heals=Heals.WITH_TIME, measured=True)
+_rule = functools.partial(Rule, heals=Heals.WITH_TIME, measured=True)
 
 DELAY = _rule(
     id="flow.delay",

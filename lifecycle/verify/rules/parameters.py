@@ -19,32 +19,27 @@ from lifecycle.verify.view import NodeFacts, View
 MISSING = Rule(
     id="param.missing",
     meaning="a node does not have a parameter that is declared or given",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the name, or have the node declare it; a value for none has no effect",
     heals=Heals.WITH_TIME,
 )
 TYPE_DIFFERS = Rule(
     id="param.type-differs",
     meaning="a parameter has another type than is declared or given",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the declaration, or the node; ROS converts nothing, 1 is no double",
 )
 VALUE_DIFFERS = Rule(
     id="param.value-differs",
     meaning="a parameter has another value than the manifest gives or declares as its default",
-    outcomes=(Outcome.VIOLATED,),
     fix="give the value that is meant, in the manifest or with `ros2 param set`",
 )
 READ_ONLY_DIFFERS = Rule(
     id="param.read-only-differs",
     meaning="a parameter that is declared read_only can be set while the node runs",
-    outcomes=(Outcome.VIOLATED,),
     fix="have the node declare it read-only, or remove read_only from the interface",
 )
 UNDECLARED = Rule(
     id="param.undeclared",
     meaning="a declared node has parameters that its interface does not declare",
-    outcomes=(Outcome.VIOLATED,),
     fix="declare them in the node's interface, remove them, or set `endpoints: open` on the node",
 )
 UNVERIFIABLE = Rule(

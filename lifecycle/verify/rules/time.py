@@ -17,7 +17,6 @@ from lifecycle.verify.view import View
 NO_CLOCK = Rule(
     id="time.no-clock",
     meaning="nodes use simulated time, and nobody publishes /clock",
-    outcomes=(Outcome.VIOLATED,),
     fix="start the simulator or the bag (`ros2 bag play --clock`), or set use_sim_time: false",
     heals=Heals.WITH_TIME,
     absence="publisher of simulated time",
@@ -25,7 +24,6 @@ NO_CLOCK = Rule(
 SEVERAL_CLOCKS = Rule(
     id="time.several-clocks",
     meaning="nodes use simulated time, and /clock has more than one publisher",
-    outcomes=(Outcome.VIOLATED,),
     fix="stop all but one: each makes time jump to its own",
 )
 UNDECLARED_CLOCK = Rule(
