@@ -1,9 +1,8 @@
 """JSON encoding and decoding of the package's types (msgspec.Struct), and ranges for their schemas.
 
 Owns: the one way a value becomes JSON (control channel, reports, files) and becomes typed
-again. Enums travel as their values, tuples as arrays, None as null. Owns also the ranges in the
-schemas of results (`make schemas`); reading enforces none of them, because each reader reports what
-is out of range in its own message; and reading the tables that ship inside the package:
+again. Enums travel as their values, tuples as arrays, None as null. Owns also ranges of integers,
+which reading enforces and schemas have; and reading the tables that ship inside the package:
 `lifecycle/network/data/` holds transcribed facts with their sources, nothing is computed into them.
 Imports nothing of the package.
 """
@@ -20,18 +19,21 @@ T = TypeVar("T")
 
 
 def says(**keywords: object) -> msgspec.Meta:
-    """Return what a schema requires of a value, for `Annotated`: `says(minimum=1)`."""
+    """Return what a schema requires of a value, for `Annotated`: `says(const=1)`."""
     return msgspec.Meta(extra_json_schema=keywords)
 
 
-Count = Annotated[int, says(minimum=0)]
-Positive = Annotated[int, says(minimum=1)]
-DomainId = Annotated[int, says(minimum=0, maximum=232)]
-DscpValue = Annotated[int, says(minimum=0, maximum=63)]
-FlowLabel = Annotated[int, says(minimum=0, maximum=0xFFFFF)]
-Octet = Annotated[int, says(minimum=0, maximum=0xFF)]
-Port = Annotated[int, says(minimum=1, maximum=65535)]
-PortOrNone = Annotated[int, says(minimum=0, maximum=65535)]
+LARGEST = 2**63 - 1
+"""JSON of ours has no larger integer."""
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=LARGEST)]
+Positive = Annotated[int, msgspec.Meta(ge=1, le=LARGEST)]
+DomainId = Annotated[int, msgspec.Meta(ge=0, le=232)]
+DscpValue = Annotated[int, msgspec.Meta(ge=0, le=63)]
+FlowLabel = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFF)]
+Octet = Annotated[int, msgspec.Meta(ge=0, le=0xFF)]
+Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+PortOrNone = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 
 
 def to_json(value: object) -> bytes:

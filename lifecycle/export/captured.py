@@ -38,7 +38,7 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.tool_filter import is_noise_endpoint, is_noise_node, known_node
+from lifecycle.verify.tool_filter import is_noise_endpoint, known_node, tolerating_pattern
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
 
@@ -174,7 +174,7 @@ def capture(
     unknown: list[ObservedEndpoint] = []
     for endpoint in observation.endpoints:
         name = known_node(owners.get(endpoint.node, endpoint.node))
-        if is_noise_node(name) or is_noise_endpoint(
+        if tolerating_pattern(name) or is_noise_endpoint(
             endpoint.kind, name, endpoint.name, endpoint.type, ours=name in configurations
         ):
             continue
@@ -312,7 +312,7 @@ def _counted(nodes: Iterable[ObservedNode], owners: Mapping[str, str]) -> dict[s
     found: dict[str, ObservedNode] = {}
     for node in sorted(nodes, key=lambda each: each.full_name):
         name = node.full_name
-        if not known_node(name) or is_noise_node(name) or name in owners:
+        if not known_node(name) or tolerating_pattern(name) or name in owners:
             continue
         other = found.get(name)
         count = node.count + (other.count if other else 0)

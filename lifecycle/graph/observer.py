@@ -32,7 +32,6 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.tool_filter import (
     DeclaredNames,
-    is_noise_node,
     known_node,
     tolerating_pattern,
 )
@@ -159,7 +158,7 @@ class Observer:
         names = DeclaredNames.of(plan)
         while True:
             self._changed.clear()
-            nodes, endpoints = self.discovery.snapshot(declared=planned, names=names)
+            nodes, endpoints = self.discovery.snapshot(names=names)
             settling_s = self.discovery.settling.left_s()
             if settling_s <= 0:
                 break
@@ -457,4 +456,4 @@ async def _answer(what: str, node: str, asking: Awaitable[_T]) -> _T | None:
 def _counts(name: str) -> bool:
     """Whether a node is part of a system: no tool's, no hidden one, and its name is known."""
     hidden = name.rpartition("/")[2].startswith("_")
-    return bool(known_node(name)) and not hidden and not is_noise_node(name)
+    return bool(known_node(name)) and not hidden and not tolerating_pattern(name)

@@ -13,6 +13,8 @@ from typing import TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from lifecycle.codec import Count
+
 
 class History(enum.Enum):
     """rmw_qos_history_policy_t."""
@@ -61,13 +63,13 @@ class QosProfile(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     history: History = History.KEEP_LAST
-    depth: int = 10
+    depth: Count = 10
     reliability: Reliability = Reliability.RELIABLE
     durability: Durability = Durability.VOLATILE
-    deadline_ns: int | None = None
-    lifespan_ns: int | None = None
+    deadline_ns: Count | None = None
+    lifespan_ns: Count | None = None
     liveliness: Liveliness = Liveliness.AUTOMATIC
-    liveliness_lease_duration_ns: int | None = None
+    liveliness_lease_duration_ns: Count | None = None
 
 
 UNKNOWN_QOS = QosProfile(

@@ -36,7 +36,6 @@ COLUMNS: dict[str, Callable[[FlowReport, Any], object]] = {
     "max_delay_ms": lambda report, _: (
         None if report.max_delay_ms is None else f"{report.max_delay_ms:g}"
     ),
-    "transport": lambda report, _: report.transport,
     "outcome": lambda report, _: report.outcome.value,
     "five_qi": lambda report, _: report.five_qi,
     "five_qi_reason": lambda report, _: report.five_qi_reason,

@@ -14,14 +14,14 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, UniqueHow
 from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, is_ip
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
-from lifecycle.verify.rules.measured import NOT_MEASURED, RULES, measurements
+from lifecycle.verify.rules.measured import NOT_MEASURED, OF_NUMBERS, measurements
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
@@ -35,7 +35,7 @@ from lifecycle.verify.verdict import (
 )
 from lifecycle.verify.view import Actual, FlowView, View, flow_subject
 
-_OF_NUMBERS = frozenset(each.id for each in RULES)
+_OF_NUMBERS = frozenset(each.id for each in OF_NUMBERS)
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
@@ -86,21 +86,18 @@ def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
 
 def _reported(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
     ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
-    source = uniqueness.nfes(flow.publishers)
-    destination = uniqueness.nfes(flow.subscriptions)
     carrier = effective_transport(flow)
     return FlowReport(
         topic=flow.planned.topic,
         publisher=flow.publisher,
         subscription=flow.subscription,
-        source=_used(source, carrier),
-        destination=_used(destination, carrier),
+        source=_used(uniqueness.nfes(flow.publishers), carrier),
+        destination=_used(uniqueness.nfes(flow.subscriptions), carrier),
         unique=None if None in ends else _HOW[ends.count(True)],
         dscp=_dscp(flow.publishers, carrier),
         reader_dscp=_dscp(flow.subscriptions, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
-        transport=_transport(flow, source, destination),
         outcome=_outcome(flow, spoiled),
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
@@ -132,29 +129,6 @@ def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
     return read.pop() if len(read) == 1 else None
 
 
-def _transport(
-    flow: FlowView,
-    source: Sequence[NetworkFlowEndpoint],
-    destination: Sequence[NetworkFlowEndpoint],
-) -> str:
-    """Return what can carry a flow: transports both ends list, shared memory on one machine only.
-
-    NFEs do not prove which of them carries the data, so several are joined by "or".
-    """
-    if not source or not destination:
-        return "unknown"
-    machines = {each.configuration.identity.machine_id for each in flow.nodes if each.configuration}
-    common: list[str] = []
-    if len(machines) == 1 and not all(map(is_ip, source)) and not all(map(is_ip, destination)):
-        common.append(Medium.SHM)
-    arriving = {(each.transport_protocol, each.internet_protocol) for each in destination}
-    for each in source:
-        place = (each.transport_protocol, each.internet_protocol)
-        if is_ip(each) and place in arriving and each.transport_protocol.value not in common:
-            common.append(each.transport_protocol.value)
-    return " or ".join(common) or "none"
-
-
 def verify(
     plan: Plan,
     observation: Observation,
@@ -182,12 +156,10 @@ def verify(
     """
     view = lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over)
     findings = tuple(finding for check in CHECKS for finding in check(view))
-    return Verdict(
-        verdict=Outcome.worst(
-            each.outcome for each in findings if not is_trusted(each, view.plan.policy)
-        ),
-        blocking=_blocks(findings, view.plan.policy),
-        findings=findings,
+    judged = Verdict(
+        verdict=Outcome.OK,
+        blocking=False,
+        findings=(),
         flows=flow_reports(view, findings),
         open_endpoints=tuple(
             OpenEndpoint(kind=each.kind, node=each.node, name=each.name, type=each.type)
@@ -197,6 +169,7 @@ def verify(
         tolerated=_tolerated(view),
         measured=measurements(view),
     )
+    return with_only(judged, findings, plan.policy)
 
 
 def without_measured(verdict: Verdict, policy: Policy) -> Verdict:
@@ -333,33 +306,23 @@ def missing(verdict: Verdict) -> str:
     findings = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if not findings and verdict.blocking:
         findings = list(verdict.findings)
-    absent: list[str] = []
-    wrong: list[str] = []
-    unknown: list[str] = []
+    named: dict[str, dict[str, None]] = {"missing": {}, "wrong": {}, "unknown": {}}
     broken = {each.rule for each in findings}
     for finding in findings:
         kind = rule(finding.rule)
-        named = f"{finding.subject} ({finding.rule})"
+        it = f"{finding.subject} ({finding.rule})"
         if kind.absence and finding.outcome is Outcome.VIOLATED:
             what = finding.endpoint.noun if finding.endpoint else ""
             phrase = kind.absence.format(kind=what, node=finding.node)
-            absent.append(f"{finding.subject} ({phrase})")
+            named["missing"][f"{finding.subject} ({phrase})"] = None
         elif kind.awaits is not None:
             # While what would show it is missing, that is what is waited for.
             if kind.awaits.id not in broken:
-                unknown.append(named)
-        elif finding.outcome is Outcome.UNVERIFIABLE:
-            unknown.append(named)
+                named["unknown"][it] = None
         else:
-            wrong.append(named)
-    parts = []
-    if absent:
-        parts.append("missing: " + ", ".join(dict.fromkeys(absent)))
-    if wrong:
-        parts.append("wrong: " + ", ".join(dict.fromkeys(wrong)))
-    if unknown:
-        parts.append("unknown: " + ", ".join(dict.fromkeys(unknown)))
-    return "; ".join(parts)
+            is_known = finding.outcome is Outcome.VIOLATED
+            named["wrong" if is_known else "unknown"][it] = None
+    return "; ".join(f"{word}: {', '.join(each)}" for word, each in named.items() if each)
 
 
 def not_ok(verdict: Verdict) -> str:

@@ -48,6 +48,10 @@ from lifecycle.verify.view import (
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
 """One node's endpoints by kind and name."""
 
+_Left = dict[tuple[EndpointKind, str, bool], list[EndpointReport]]
+"""Reports that are of no declared endpoint yet: by kind and declared name, or by kind and resolved
+name of those that have no other; each report is of one declared endpoint."""
+
 _TURNS = ((True, True), (True, False), (False, False))
 """Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
 whose node reports it so, the rest. So one wrong type does not take another one's place. Each says
@@ -125,7 +129,7 @@ def lay_out(
         of_tools=of_tools,
         groups=groups,
         seen=_seen(groups, actual, tools),
-        seen_of_tools=tuple(map(_not_declared, _topical(of_tools))),
+        seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
         measured=observation.measured,
@@ -171,7 +175,7 @@ def _attributed(
         ours = (owner.node if owner is not None else node) in configurations
         for each in endpoints:
             whose = owner.node if owner is not None and owner.has(each) else node
-            if _counts(each, whose, names, ours=ours):
+            if names.keeps(each, whose, ours=ours):
                 by_node.setdefault(whose, []).append(_as_of(each, whose))
     return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
 
@@ -206,17 +210,6 @@ def _unknown(
         # Half of a service may be seen before its node is: it is no second one.
         known = node and not endpoint.kind.is_topic
         yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
-
-
-def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours: bool) -> bool:
-    """Return whether an endpoint of a node is declared, feeds what is, or was made on purpose."""
-    return (
-        (node, endpoint.kind, endpoint.name) in names.ends
-        or (node not in names.nodes and names.looks_for(endpoint.kind, endpoint.name))
-        or not is_noise_endpoint(
-            endpoint.kind, endpoint.node, endpoint.name, endpoint.type, ours=ours
-        )
-    )
 
 
 def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
@@ -266,7 +259,9 @@ def _match_node(
     beyond: bool,
 ) -> tuple[list[Actual], list[ObservedEndpoint]]:
     """Match one node's declarations to what is seen of it; return them and what is left over."""
-    reports = _Reports(configuration.endpoints if configuration else ())
+    reports: _Left = {}
+    for one in configuration.endpoints if configuration else ():
+        reports.setdefault(_left_key(one), []).append(one)
     pools: _Pools = {}
     for each in endpoints:
         pools.setdefault(_place(each), []).append(each)
@@ -278,8 +273,7 @@ def _match_node(
             if index in matched:
                 continue
             place = (planned.kind, planned.resolved)
-            picked = reports.pick(planned, exact=exact_report)
-            report = reports.get(picked)
+            report = _pick_report(planned, reports, exact=exact_report)
             observed = _pick_observed(planned, report, pools.get(place, []), exact=exact_observed)
             if exact_report and (observed if exact_observed else report) is None:
                 continue  # its turn comes
@@ -290,7 +284,8 @@ def _match_node(
                 used.add(place)  # found by name only: it represents any number of them
             elif unseen and report is not None and report.resolved == planned.resolved:
                 observed = _as_observed(node, report) if _is_there(report) else None
-            reports.take(picked)
+            if report is not None:
+                reports[_left_key(report)].remove(report)
             matched[index] = Actual(
                 node=node,
                 planned=planned,
@@ -311,7 +306,8 @@ def _match_node(
     ]
     rest += [
         _as_observed(node, report)
-        for report in reports.left
+        for left in reports.values()
+        for report in left
         if (report.kind, report.resolved) not in places
         and not is_noise_endpoint(
             report.kind, node.full_name, report.resolved, report.type, ours=True
@@ -320,41 +316,19 @@ def _match_node(
     return [matched[index] for index in range(len(node.endpoints))], rest
 
 
-class _Reports:
-    """What a node reports, in its order; each report is of one declared endpoint."""
+def _pick_report(planned: PlannedEndpoint, left: _Left, *, exact: bool) -> EndpointReport | None:
+    """Choose the report on a declared endpoint: by its declared name, else its resolved one."""
+    named = left.get((planned.kind, planned.name, True))
+    if named:
+        return named[0]
+    for each in left.get((planned.kind, planned.resolved, False), ()):
+        if each.type == planned.type or not exact:
+            return each
+    return None
 
-    def __init__(self, endpoints: Iterable[EndpointReport]) -> None:
-        self._left = dict(enumerate(endpoints))
-        self._named: dict[tuple[EndpointKind, str], list[int]] = {}
-        self._nameless: dict[tuple[EndpointKind, str], list[int]] = {}
-        for index, each in self._left.items():
-            self._named.setdefault((each.kind, each.name), []).append(index)
-            if not each.name:
-                self._nameless.setdefault((each.kind, each.resolved), []).append(index)
 
-    @property
-    def left(self) -> Iterable[EndpointReport]:
-        """Those that were not taken."""
-        return self._left.values()
-
-    def pick(self, planned: PlannedEndpoint, *, exact: bool) -> int | None:
-        """Choose the report on a declared endpoint: by its declared name, else its resolved one."""
-        for index in self._named.get((planned.kind, planned.name), ()):
-            if index in self._left:
-                return index
-        for index in self._nameless.get((planned.kind, planned.resolved), ()):
-            if index in self._left and (not exact or self._left[index].type == planned.type):
-                return index
-        return None
-
-    def get(self, index: int | None) -> EndpointReport | None:
-        """Return a report that was picked."""
-        return None if index is None else self._left[index]
-
-    def take(self, index: int | None) -> None:
-        """Leave out a report from now on: it belongs to a declared endpoint."""
-        if index is not None:
-            del self._left[index]
+def _left_key(report: EndpointReport) -> tuple[EndpointKind, str, bool]:
+    return report.kind, report.name or report.resolved, bool(report.name)
 
 
 def _pick_observed(
@@ -466,18 +440,6 @@ def _end(
     )
 
 
-def _not_declared(endpoint: ObservedEndpoint) -> SeenEndpoint:
-    return SeenEndpoint(
-        kind=endpoint.kind,
-        node=endpoint.node,
-        name=endpoint.name,
-        type=endpoint.type,
-        qos=endpoint.qos,
-        type_hash=endpoint.type_hash,
-        is_stranger=True,
-    )
-
-
 def _seen(
     groups: Mapping[str, tuple[ObservedEndpoint, ...]],
     actual: Sequence[Actual],
@@ -489,7 +451,7 @@ def _seen(
     found = [each.end for each in topical if each.beyond and each.observed is None]
     declared = {id(each.observed): each.end for each in topical if each.observed is not None}
     found += [
-        declared.get(id(each)) or _not_declared(each)
+        declared.get(id(each)) or SeenEndpoint.of(each)
         for name, group in groups.items()
         if name not in tools
         for each in _topical(group)

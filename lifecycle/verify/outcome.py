@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable
+from typing import Annotated
 
 import msgspec
 
@@ -42,7 +43,7 @@ class ConnectionReport(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     urls: tuple[str, ...] = ()
     node_name: str = ""
-    prefix: str = ""
+    prefix: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{24})?$")] = ""
     established: bool = False
     mappings: tuple[str, ...] = ()
     error: str = ""

@@ -32,8 +32,7 @@ from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.plan.model import Plan
 from lifecycle.printable import columns, json_text, one_line
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import RULES
-from lifecycle.verify.rules.catalogue import Rule
+from lifecycle.verify.rules import RULES, rule
 from lifecycle.verify.verdict import Finding, FlowReport, RunEnd, Verdict
 
 _COLOURS = {Outcome.OK: "\x1b[32m", Outcome.VIOLATED: "\x1b[31m", Outcome.UNVERIFIABLE: "\x1b[33m"}
@@ -161,85 +160,66 @@ def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> st
         plan: None where there is none, because the manifest cannot be used.
         strict: what cannot be verified refuses the system, whatever its policy says.
     """
-    writer = _Cases(verdict, plan, strict=strict)
-    suites = [Suite(name="manifest", cases=[writer.of_manifest()])]
-    families: dict[str, list[Rule]] = {}
-    for rule in RULES:
-        families.setdefault(rule.id.partition(".")[0], []).append(rule)
-    for family, rules in families.items():
-        cases = [writer.of_rule(rule) for rule in rules]
+
+    def case(classname: str, name: str, found: Sequence[Finding], *, skipped: str = "") -> Case:
+        bad = [each for each in found if _refuses(each, plan, strict=strict)]
+        allowed = [each for each in found if each not in bad]
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        return Case(
+            classname=classname,
+            name=name,
+            at=next((each.at for each in (*bad, *allowed)), ""),
+            failure=(bad[0].message + more, _described(bad)) if bad else None,
+            note=_described(allowed),
+            skipped="" if found or verdict.judged else skipped,
+        )
+
+    wrong = [each for each in verdict.findings if each.rule not in _IDS]
+    suites = [Suite(name="manifest", cases=[case("manifest", "the manifest is valid", wrong)])]
+    for family in dict.fromkeys(each.family for each in RULES):
+        cases = [
+            case(
+                one.id,
+                one.meaning,
+                [each for each in verdict.findings if each.rule == one.id],
+                skipped="not judged; see the end of the run",
+            )
+            for one in RULES
+            if one.family == family
+        ]
         if family == "run":
-            cases.append(writer.of_end())
+            cases.append(_end(verdict))
         flows = verdict.flows if family == "flow" else ()
         note = "".join(f"{_flow(each)}\n" for each in flows)
         suites.append(Suite(name=family, cases=cases, note=note))
     return junit(suites, name=f"lifecycle verify {plan.system}" if plan else "lifecycle verify")
 
 
-class _Cases:
-    """Writes the cases of one verdict."""
-
-    def __init__(self, verdict: Verdict, plan: Plan | None, *, strict: bool) -> None:
-        self._verdict = verdict
-        self._blocks = strict or (plan is not None and plan.policy.unverifiable_blocks)
-        self._trust = () if plan is None else plan.policy.trust
-        self._strict = strict
-        self._may_block = {each.id: each.may_block for each in RULES}
-
-    def of_manifest(self) -> Case:
-        """Hold what is wrong with the manifest itself: no rule of the running system."""
-        found = [each for each in self._verdict.findings if each.rule not in _IDS]
-        return self._case("manifest", "the manifest is valid", found)
-
-    def of_rule(self, rule: Rule) -> Case:
-        """Hold all findings of one rule."""
-        found = [each for each in self._verdict.findings if each.rule == rule.id]
-        skipped = "" if found or self._verdict.judged else "not judged; see the end of the run"
-        return self._case(rule.id, rule.meaning, found, skipped=skipped)
-
-    def of_end(self) -> Case:
-        """Fail where the run was no success: one without a judged system must not read well."""
-        run = self._verdict.run
-        if run is None and self._verdict.judged:
-            return Case(classname="run", name="end")
-        run = run or RunEnd(reason="nothing was judged", reached=None, exit_code=1)
-        text = run.describe() + "\n"
-        if run.exit_code == 0:
-            return Case(classname="run", name="end", note=text)
-        return Case(classname="run", name="end", failure=(run.reason, text))
-
-    def _case(
-        self, classname: str, name: str, findings: Sequence[Finding], *, skipped: str = ""
-    ) -> Case:
-        bad = [each for each in findings if self._refuses(each)]
-        allowed = [each for each in findings if each not in bad]
-        failure = None
-        if bad:
-            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-            failure = (bad[0].message + more, _described(bad))
-        return Case(
-            classname=classname,
-            name=name,
-            at=next((each.at for each in (*bad, *allowed)), ""),
-            failure=failure,
-            note=_described(allowed),
-            skipped=skipped,
-        )
-
-    def _refuses(self, finding: Finding) -> bool:
-        """Whether a finding keeps the gate closed."""
-        if finding.outcome is Outcome.UNVERIFIABLE:
-            if finding.rule in self._trust:
-                return False
-            return self._blocks and (self._strict or self._may_block.get(finding.rule, True))
+def _refuses(finding: Finding, plan: Plan | None, *, strict: bool) -> bool:
+    """Return whether a finding keeps the gate closed."""
+    if finding.outcome is not Outcome.UNVERIFIABLE:
         return finding.outcome is Outcome.VIOLATED
+    if plan is not None and finding.rule in plan.policy.trust:
+        return False
+    blocks = plan is not None and plan.policy.unverifiable_blocks
+    return strict or (blocks and (finding.rule not in _IDS or rule(finding.rule).may_block))
+
+
+def _end(verdict: Verdict) -> Case:
+    """Fail where the run was no success: one without a judged system must not read well."""
+    run = verdict.run
+    if run is None and verdict.judged:
+        return Case(classname="run", name="end")
+    run = run or RunEnd(reason="nothing was judged", reached=None, exit_code=1)
+    text = run.describe() + "\n"
+    if run.exit_code == 0:
+        return Case(classname="run", name="end", note=text)
+    return Case(classname="run", name="end", failure=(run.reason, text))
 
 
 def _described(findings: Iterable[Finding]) -> str:
     return "\n".join(
-        f"{each.outcome.value} {each.rule}: {one_line(each.subject)}\n{one_line(each.message)}\n"
-        f"expected: {one_line(each.expected)}\nobserved: {one_line(each.observed)}\n"
-        f"at: {one_line(each.at)}\nto do: {one_line(each.hint)}\n"
+        "".join(f"{line}\n" for line in _finding(each, colour=False, width=100))
         for each in findings
     )
 
@@ -255,12 +235,12 @@ def to_sarif(verdict: Verdict) -> str:
     """Write a SARIF log with one run; every rule is described, found or not."""
     rules: list[Json] = [
         {
-            "id": rule.id,
-            "shortDescription": {"text": rule.meaning},
-            "help": {"text": rule.fix},
-            "defaultConfiguration": {"level": _LEVELS[rule.outcomes[0]]},
+            "id": each.id,
+            "shortDescription": {"text": each.meaning},
+            "help": {"text": each.fix},
+            "defaultConfiguration": {"level": _LEVELS[each.outcomes[0]]},
         }
-        for rule in RULES
+        for each in RULES
     ]
     return sarif(
         [*map(_problem, verdict.findings), *_end_result(verdict)],
@@ -332,12 +312,9 @@ def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
     }
     if not verdict.judged:
         document["judged"] = False
-    if verdict.open_endpoints:
-        document["open_endpoints"] = codec.to_plain(verdict.open_endpoints)
-    if verdict.tolerated:
-        document["tolerated"] = codec.to_plain(verdict.tolerated)
-    if verdict.measured:
-        document["measured"] = codec.to_plain(verdict.measured)
+    for name in ("open_endpoints", "tolerated", "measured"):
+        if found := getattr(verdict, name):
+            document[name] = codec.to_plain(found)
     if verdict.run is not None:
         run = codec.to_plain(verdict.run)
         assert isinstance(run, dict)

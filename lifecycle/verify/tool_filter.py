@@ -20,26 +20,15 @@ import msgspec
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind, RosInterfaceAccess
 from lifecycle.manifest.names import (
-    ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MODE_SERVICE,
     NODE_SERVICES,
     OUR_SERVICES,
     SUPERVISOR_STATUS,
     SUPERVISORS,
-    supervisor_alive_topic,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
-)
-from lifecycle.manifest.qos import (
-    Certainty,
-    Durability,
-    History,
-    Liveliness,
-    QosProfile,
-    Reliability,
-    incompatibilities,
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan, uses_sim_time
@@ -53,17 +42,7 @@ _OUR_TOPICS = "/_lifecycle/"
 """Where the supervisors of several machines notice each other."""
 
 _DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
-_DIAGNOSTICS_QOS = QosProfile(
-    history=History.KEEP_LAST,
-    depth=10,
-    reliability=Reliability.RELIABLE,
-    durability=Durability.VOLATILE,
-    liveliness=Liveliness.AUTOMATIC,
-)
-"""What a supervisor's publisher offers."""
 _SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
-_ALIVE_TYPES = {"": "std_msgs/msg/String", ALIVE_PULSE: "std_msgs/msg/Empty"}
-"""Of the topics on which a supervisor asserts its liveliness, by the ends of their names."""
 _SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
@@ -137,12 +116,6 @@ def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NOD
     return ""
 
 
-@functools.lru_cache(maxsize=1 << 12)
-def is_noise_node(full_name: str) -> bool:
-    """Return whether a node is named as a tool that any user may be expected to run."""
-    return bool(tolerating_pattern(full_name))
-
-
 def matches(name: str, pattern: str) -> bool:
     """Return whether a name is as a pattern of a manifest has it: `*`, `?`, all else as it is."""
     return _compiled(pattern).fullmatch(name) is not None
@@ -168,19 +141,14 @@ class DeclaredNames(msgspec.Struct, frozen=True):
         names: by the kind that offers, fully qualified, those that endpoints declare.
         of_supervisors: likewise, those that only supervisors of the plan may have, whatever
             `policy.ros_interface` says.
-        alive: names of the topics by which its supervisors assert their liveliness to each other.
         simulated: nodes of the plan have `use_sim_time`, so that it matters who publishes /clock.
-        diagnosed: the plan declares who reads /diagnostics, so that it must be known who are
-            supervisors, those of other systems too.
     """
 
     nodes: frozenset[str] = frozenset()
     ends: frozenset[tuple[str, EndpointKind, str]] = frozenset()
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
     of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
-    alive: frozenset[str] = frozenset()
     simulated: bool = False
-    diagnosed: bool = False
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
@@ -202,9 +170,7 @@ class DeclaredNames(msgspec.Struct, frozen=True):
             names=names,
             # A manifest may declare a node of its own that has them.
             of_supervisors=of_supervisors - names,
-            alive=frozenset(topic for topic, _ in _alive(plan)),
             simulated=any(map(uses_sim_time, plan.nodes)),
-            diagnosed=(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC) in names,
         )
 
     def of_kind(self, kind: EndpointKind) -> tuple[str, ...]:
@@ -235,9 +201,22 @@ class DeclaredNames(msgspec.Struct, frozen=True):
 
     def looks_for(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
-        if kind is EndpointKind.PUBLISHER and name in self.alive:
-            return True
-        return self.fed_by(kind, name) or (self.diagnosed and _is_status(kind, name))
+        return self.fed_by(kind, name) or _is_status(kind, name)
+
+    def keeps(self, endpoint: ObservedEndpoint, node: str, *, ours: bool) -> bool:
+        """Return whether an endpoint is declared, feeds what is, or was made on purpose.
+
+        Args:
+            endpoint: as discovery shows it.
+            node: full name of the node whose it is.
+            ours: see `is_noise_endpoint`.
+        """
+        kind, name = endpoint.kind, endpoint.name
+        return (
+            (node, kind, name) in self.ends
+            or (node not in self.nodes and self.looks_for(kind, name))
+            or not is_noise_endpoint(kind, endpoint.node, name, endpoint.type, ours=ours)
+        )
 
 
 _OWN: Mapping[EndpointKind, Collection[str]] = {
@@ -309,9 +288,9 @@ def _below(
 def takes_diagnostics(plan: Plan) -> bool:
     """Return whether a supervisor may publish on /diagnostics and disturb nothing of the plan.
 
-    It may not where the manifest has the name for something else, where its publisher would be of
-    no use to a declared subscription, and where the manifest says what flow the topic must have:
-    what the supervisor sent to the same port would be part of what was verified and programmed.
+    It may not where the manifest has the name for something else, and where it says what flow the
+    topic must have: what the supervisor sent to the same port would be part of what was verified
+    and programmed.
     """
     ends = [
         each for node in plan.nodes for each in node.endpoints if each.resolved == DIAGNOSTICS_TOPIC
@@ -322,14 +301,6 @@ def takes_diagnostics(plan: Plan) -> bool:
         and each.unique in free
         and each.dscp is None
         and each.five_qi is None
-        and (
-            each.kind is not EndpointKind.SUBSCRIPTION
-            or each.qos is None
-            or all(
-                found.severity is not Certainty.CERTAIN
-                for found in incompatibilities(_DIAGNOSTICS_QOS, each.qos)
-            )
-        )
         for each in ends
     )
 
@@ -345,80 +316,55 @@ def of_supervisors(
 ) -> frozenset[ObservedEndpoint]:
     """Return those endpoints that supervisors offer as policies allow, of this or another system.
 
-    A name proves nothing: the participant that publishes a status topic, or asserts the liveliness
-    of a machine's supervisor, is that supervisor, if no other does; its services are of the same
-    node, and what it publishes on /diagnostics is of the same participant. Either may be seen late:
-    after an outage of a link they arrive one after the other.
+    A name proves nothing: who offers something below a supervisor's prefix is that supervisor if
+    no other participant does, and what it publishes on /diagnostics is of that participant.
 
     Args:
         plan: of the system that is judged.
         endpoints: of tools.
     """
-    ours = supervisor_prefixes(plan)
-    alive = _alive(plan)
-    found: list[ObservedEndpoint] = []
-    asserting: list[ObservedEndpoint] = []
-    claims: dict[str, set[_Claim]] = {}
+    ours, access = supervisor_prefixes(plan), plan.policy.access
+    prefixes = {
+        place: prefix for prefix in ours for place in _below(prefix, plan, RosInterfaceAccess.FULL)
+    }
+    allowed = {
+        place
+        for prefix in (() if access is RosInterfaceAccess.OFF else ours)
+        for place in _below(prefix, plan, access)
+    }
+    found: list[tuple[str, ObservedEndpoint]] = []
+    claims: dict[str, tuple[set[str], set[str]]] = {}
     for each in endpoints:
         if is_supervisor_endpoint(each.kind, each.node, each.name, each.type):
-            found.append(each)
-            if _is_status(each.kind, each.name):
-                claims.setdefault(each.name.rpartition("/")[0], set()).add(_claim(each))
-        elif _may_assert(each) and (prefix := alive.get((each.name, each.type))) is not None:
-            asserting.append(each)
-            claims.setdefault(prefix, set()).add(_claim(each))
-    access = plan.policy.access
-    known: dict[str, _Claim] = {}
-    services: set[tuple[str, EndpointKind, str]] = set()
-    for prefix, (claim, *others) in claims.items():
-        if others or (prefix in ours and access is RosInterfaceAccess.OFF):
-            continue
-        known[prefix] = claim
-        if prefix in ours:
-            services |= {(claim[0], *each) for each in _below(prefix, plan, access)}
-    participants = set(known.values())
-    diagnoses = takes_diagnostics(plan)
-    allowed = [
-        each
-        for each in found
-        if (
-            _is_status(each.kind, each.name)
-            and known.get(each.name.rpartition("/")[0]) == _claim(each)
-        )
-        or (not each.kind.is_topic and (each.node, each.kind, each.name) in services)
-        or (each.name == DIAGNOSTICS_TOPIC and diagnoses and _claim(each) in participants)
-    ]
-    return frozenset((*allowed, *asserting))
-
-
-_Claim = tuple[str, str]
-"""A node's name and the GUID prefix of its participant."""
-
-
-def _claim(endpoint: ObservedEndpoint) -> _Claim:
-    return endpoint.node, endpoint.gid[:PREFIX_DIGITS]
-
-
-def _alive(plan: Plan) -> dict[tuple[str, str], str]:
-    """Return the topics by which supervisors of a plan assert their liveliness, each with its type.
-
-    Returns:
-        The prefix of the supervisor, see `supervisor_prefix`, by name and type.
-    """
-    machines = {each.machine for each in plan.nodes}
-    return {
-        (supervisor_alive_topic(plan.system, machine) + end, type_): supervisor_prefix(
-            plan.system, machine
-        )
-        for machine in (machines if len(machines) > 1 else ())
-        if machine
-        for end, type_ in _ALIVE_TYPES.items()
+            prefix = prefixes.get((each.kind, each.name), each.name.rpartition("/")[0])
+            found.append((prefix, each))
+            nodes, participants = claims.setdefault(prefix, (set(), set()))
+            nodes.add(each.node)
+            participants.update((each.gid[:PREFIX_DIGITS],) if each.gid else ())
+    believed = {
+        prefix: participants
+        for prefix, (nodes, participants) in claims.items()
+        if prefix and len(nodes) == 1 and len(participants) <= 1
     }
-
-
-def _may_assert(endpoint: ObservedEndpoint) -> bool:
-    """Return whether an endpoint may be one by which a supervisor asserts its liveliness."""
-    return endpoint.kind is EndpointKind.PUBLISHER and _is_observer(endpoint.node)
+    diagnosing = {
+        each
+        for prefix, found in believed.items()
+        if prefix not in ours or access is not RosInterfaceAccess.OFF
+        for each in found
+    }
+    return frozenset(
+        each
+        for prefix, each in found
+        if (
+            takes_diagnostics(plan) and each.gid[:PREFIX_DIGITS] in diagnosing
+            if each.name == DIAGNOSTICS_TOPIC
+            else prefix in believed
+            and (
+                (each.kind, each.name) in allowed
+                or (prefix not in ours and _is_status(each.kind, each.name))
+            )
+        )
+    )
 
 
 def _is_observer(full_name: str) -> bool:
@@ -495,31 +441,6 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
     return frozenset(node for node, bases in offered.items() if bases >= OURS_BY)
 
 
-def without_noise(
-    endpoints: Iterable[ObservedEndpoint],
-    *,
-    but: DeclaredNames = NO_NAMES,
-    ours: Collection[str] | None = None,
-) -> tuple[ObservedEndpoint, ...]:
-    """Return what was written on purpose, in order; the input must be complete per node.
-
-    Args:
-        endpoints: to choose from.
-        but: names that are looked for: endpoints of them are kept, whatever they look like.
-        ours: names of the nodes that are ours; None for `our_nodes` of these endpoints.
-    """
-    found = tuple(endpoints)
-    if ours is None:
-        ours = our_nodes(found)
-    return tuple(
-        each
-        for each in found
-        if (each.node, each.kind, each.name) in but.ends
-        or but.looks_for(each.kind, each.name)
-        or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
-    )
-
-
 def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | None:
     """Return the action endpoint that a hidden topic or service is a part of.
 
@@ -545,9 +466,9 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
     """Replace complete sets of an action's hidden endpoints by one action endpoint.
 
     A server is complete with three services and two publishers, a client with three service
-    clients and two subscriptions. Parts of an incomplete action stay as they are: an action that
-    discovery shows only half of is not there yet. So do those of another type than their action's,
-    and those of a server that are there once more. Action endpoints in the input stay.
+    clients and two subscriptions, all of the action's types. Other parts stay as they are: an
+    action that discovery shows only half of is not there yet. A client that a node has several
+    times is one end. Action endpoints in the input stay.
     """
     kept: list[ObservedEndpoint] = []
     groups: dict[tuple[str, EndpointKind, str], list[ObservedEndpoint]] = {}
@@ -559,20 +480,21 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
             groups.setdefault((endpoint.node, *action), []).append(endpoint)
     known = {(each.node, each.kind, each.name) for each in kept}
     for (node, side, name), parts in groups.items():
-        named: dict[str, list[ObservedEndpoint]] = {}
-        for each in parts:
-            named.setdefault(each.name.rpartition("/")[2], []).append(each)
-        type_ = _action_type(named)
-        left = list(parts)
-        if (node, side, name) in known and side is EndpointKind.ACTION_CLIENT:
-            continue  # one that a node has several times is one end
-        while named.keys() == _ACTION_PARTS.keys():
-            # What has another type makes the action complete, and is left over.
-            chosen = {
-                part: next((e for e in found if e.type == part_type(part, type_)), found[0])
-                for part, found in named.items()
-            }
-            goals = chosen["send_goal"]
+        calls = side is EndpointKind.ACTION_CLIENT
+        if calls and (node, side, name) in known:
+            continue
+        type_ = _action_type(parts)
+        named = {
+            part: [
+                each
+                for each in parts
+                if (each.name, each.type) == (f"{name}{_ACTION_PART}{part}", part_type(part, type_))
+            ]
+            for part in _ACTION_PARTS
+        }
+        count = min(map(len, named.values()))
+        for chosen in list(zip(*named.values(), strict=False))[: 1 if calls else count]:
+            goals = chosen[0]
             kept.append(
                 ObservedEndpoint(
                     kind=side,
@@ -581,19 +503,15 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
                     type=type_,
                     gid=goals.gid,
                     address=goals.address,
-                    type_hash=_action_hash(chosen),
+                    type_hash=_action_hash(dict(zip(named, chosen, strict=True))),
                 )
             )
-            serves = side is EndpointKind.ACTION_SERVER
-            for part, each in chosen.items():
-                taken = [each] if serves else [e for e in named[part] if e.type == each.type]
-                right = each.type == part_type(part, type_)
-                for one in taken:
-                    named[part].remove(one)
-                    if right:
-                        left.remove(one)
-            named = {part: found for part, found in named.items() if found}
-        kept.extend(left)
+        folded = {
+            id(each)
+            for found in named.values()
+            for each in (found if calls and count else found[:count])
+        }
+        kept.extend(each for each in parts if id(each) not in folded)
     return tuple(kept)
 
 
@@ -608,15 +526,13 @@ def part_type(part: str, type_: str) -> str:
     return f"{type_}{end}" if end.startswith("_") else end
 
 
-def _action_type(parts: Mapping[str, Iterable[ObservedEndpoint]]) -> str:
-    """Return the type of an action: that of most of its parts, of its goals where they differ."""
-    found = [
-        each.type.removesuffix(end)
-        for part, (_, end) in _ACTION_PARTS.items()
-        if end.startswith("_")
-        for each in parts.get(part, ())
-        if each.type.endswith(end)
-    ]
+def _action_type(parts: Iterable[ObservedEndpoint]) -> str:
+    """Return the type of an action: that of most of its parts where they differ."""
+    found = []
+    for each in parts:
+        _, end = _ACTION_PARTS[each.name.rpartition("/")[2]]
+        if end.startswith("_") and each.type.endswith(end):
+            found.append(each.type.removesuffix(end))
     return max(found, key=found.count) if found else ""
 
 

@@ -84,7 +84,6 @@ class Uniqueness:
         self._configurations = tuple(configurations)
         """Kept, so that the identities of its reports stay theirs: equal ones may be of two."""
         self._entries: dict[int, _Entry] = {}
-        self._answers: dict[int, bool | None] = {}
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
         # of one bucket are ever compared: judging grows with the endpoints, not with their square.
         # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
@@ -96,6 +95,7 @@ class Uniqueness:
                 if report.kind.is_topic and not report.error:
                     entry = self._entries[id(report)] = _entry(configuration, report, address)
                     self._add(entry)
+        self._answers = {each: self._judge(entry) for each, entry in self._entries.items()}
 
     def _add(self, entry: _Entry) -> None:
         if entry.judged is None:
@@ -115,12 +115,7 @@ class Uniqueness:
 
     def is_unique(self, end: Actual) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
-        entry = self._entries.get(id(end.report))
-        if entry is None:
-            return None
-        if id(entry) not in self._answers:
-            self._answers[id(entry)] = self._judge(entry)
-        return self._answers[id(entry)]
+        return self._answers.get(id(end.report))
 
     def _judge(self, entry: _Entry) -> bool | None:
         if entry.judged is None:

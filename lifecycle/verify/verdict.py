@@ -88,7 +88,6 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
         five_qi_reason: why it is this 5QI, or none, where the manifest says `auto`; else empty.
         effective_transport: name of the Medium that carries it; "unknown" where nothing shows it,
             "none" where the ends have nothing in common.
-        transport: "udp", "tcp", "shm or udp" …; what can carry it, as far as the NFEs show.
         tuples: IP flows that the two ends' NFEs form, each with its 5-tuple and flow label; follows
             from source and destination. Where shared memory carries the flow, none of them does.
     """
@@ -102,7 +101,6 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
     dscp: DscpValue | None
     requirement: tuple[UniqueRequirement, UniqueRequirement]
     demanded: UniqueHow
-    transport: str
     outcome: Outcome
     max_delay_ms: float | None = None
     five_qi: int | None = None

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.medium import Medium
@@ -69,6 +70,19 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     is_stranger: bool = False
     observed: bool = True
 
+    @classmethod
+    def of(cls, endpoint: ObservedEndpoint) -> SeenEndpoint:
+        """Return one that is not declared."""
+        return cls(
+            kind=endpoint.kind,
+            node=endpoint.node,
+            name=endpoint.name,
+            type=endpoint.type,
+            qos=endpoint.qos,
+            type_hash=endpoint.type_hash,
+            is_stranger=True,
+        )
+
 
 class Actual(msgspec.Struct, frozen=True, kw_only=True):
     """A declared endpoint and what was seen of it.
@@ -89,6 +103,11 @@ class Actual(msgspec.Struct, frozen=True, kw_only=True):
     end: SeenEndpoint
     unseen: bool = False
     beyond: bool = False
+
+    @property
+    def at(self) -> Position:
+        """Where it is declared."""
+        return self.planned.at
 
 
 class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):
@@ -286,26 +305,11 @@ def actual_qos(observed: QosProfile | None, reported: QosProfile | None) -> QosP
     """
     if observed is None or reported is None:
         return observed or reported
-    keeps = observed.history is not History.UNKNOWN
-    return QosProfile(
-        history=observed.history if keeps else reported.history,
-        depth=observed.depth if keeps else reported.depth,
-        reliability=(
-            reported.reliability
-            if observed.reliability is Reliability.UNKNOWN
-            else observed.reliability
-        ),
-        durability=(
-            reported.durability
-            if observed.durability is Durability.UNKNOWN
-            else observed.durability
-        ),
-        deadline_ns=observed.deadline_ns,
-        lifespan_ns=observed.lifespan_ns,
-        liveliness=(
-            reported.liveliness
-            if observed.liveliness is Liveliness.UNKNOWN
-            else observed.liveliness
-        ),
-        liveliness_lease_duration_ns=observed.liveliness_lease_duration_ns,
-    )
+    known: dict[str, object] = {
+        policy: getattr(reported, policy)
+        for policy in ("history", "reliability", "durability", "liveliness")
+        if getattr(observed, policy).value == "UNKNOWN"
+    }
+    if "history" in known:
+        known["depth"] = reported.depth
+    return replace(observed, **known)

@@ -100,7 +100,6 @@ def test_those_that_choose_or_name_a_medium_know_it_and_all_others_ask_it() -> N
     assert knowing == {
         "network/medium.py",
         "network/nfe.py",  # shared memory is what shows no address
-        "verify/judge.py",
         "verify/transport.py",
         "verify/view.py",
         "programming/rules.py",

@@ -60,9 +60,7 @@ from lifecycle.verify.tool_filter import (
     PREFIX_DIGITS,
     DeclaredNames,
     fold_actions,
-    is_noise_endpoint,
     our_nodes,
-    without_noise,
 )
 
 if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
@@ -169,9 +167,7 @@ class GraphObserver:
         """
         return self._guard.follow(self.node, callback)
 
-    def snapshot(
-        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
-    ) -> Snapshot:
+    def snapshot(self, *, names: DeclaredNames = NO_NAMES) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
         All but its own node, of which there is only what has one of these `names`. The
@@ -179,9 +175,8 @@ class GraphObserver:
         of no known node are looked for by name.
 
         Args:
-            declared: fully qualified names of nodes that are looked for.
             names: of topics, services and actions that are looked for: a node that offers one of
-                them and is not `declared` is shown, whatever it looks like.
+                them and is not declared is shown, whatever it looks like.
 
         Raises:
             MiddlewareError: the graph is no longer watched, or cannot be read; the message says
@@ -192,9 +187,9 @@ class GraphObserver:
         if names.simulated and self.owns_node:
             self._watch_clock()
         with self._lock:
-            return self._look(declared, names)
+            return self._look(names)
 
-    def _look(self, declared: Collection[str], names: DeclaredNames) -> Snapshot:
+    def _look(self, names: DeclaredNames) -> Snapshot:
         wanted = (_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER))
         topics, illegible = topic_names(self.node, self._topics_before | rmw_topics(wanted))
         shown: dict[str, list[ObservedEndpoint]] = {}
@@ -209,7 +204,9 @@ class GraphObserver:
             if each.node:
                 has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
-            if not _is_noise(each, declared, names):
+            # Of plain DDS programs only what has the names of ROS concerns a system of ROS.
+            raw = each.name.startswith(RAW)
+            if each.node if raw else names.keeps(each, each.node, ours=False):
                 shown.setdefault(each.node, []).append(self._timed(each))
         named = frozenset(itertools.chain.from_iterable(homes.values()))
         self.settling.saw(named, next(iter(homes.get(self._name, ())), ""))
@@ -241,8 +238,11 @@ class GraphObserver:
         self._ours = self._ours.intersection(shown).union(*map(our_nodes, shown.values()))
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
-            but = DeclaredNames(ends=names.ends) if name in declared else names
-            judged = without_noise(shown[name], but=but, ours=self._ours)
+            judged = tuple(
+                each
+                for each in shown[name]
+                if names.keeps(each, each.node, ours=each.node in self._ours)
+            )
             folded = fold_actions(self._hashed(name, judged, ends))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
@@ -529,21 +529,6 @@ def _as_super_client() -> Iterator[None]:
         yield
     finally:
         del os.environ[_SUPER_CLIENT_VARIABLE]
-
-
-def _is_noise(endpoint: ObservedEndpoint, declared: Collection[str], names: DeclaredNames) -> bool:
-    """Return whether a publisher or subscription is the housekeeping of a client library.
-
-    One on a topic of DDS that no ROS name has is shown if it is a node's; of plain DDS programs
-    only what has the names of ROS concerns a system of ROS.
-    """
-    kind, node, name = endpoint.kind, endpoint.node, endpoint.name
-    if name.startswith(RAW):
-        return not node
-    wanted = (node, kind, name) in names.ends or (
-        node not in declared and names.looks_for(kind, name)
-    )
-    return not wanted and is_noise_endpoint(kind, node, name, endpoint.type, ours=False)
 
 
 def _declared_services(names: DeclaredNames) -> set[str]:

@@ -27,7 +27,7 @@ from lifecycle.supervisor.run.events import (
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.run import NOT_ANSWERING, SILENT_NODE
-from lifecycle.verify.tool_filter import is_hidden_node, is_noise_node
+from lifecycle.verify.tool_filter import is_hidden_node, tolerating_pattern
 from lifecycle.verify.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
@@ -245,7 +245,7 @@ def arrivals(before: Collection[str], observation: Observation, emit: Emitter) -
     """
     names = (each.full_name for each in observation.nodes)
     present = frozenset(
-        each for each in names if not is_hidden_node(each) and not is_noise_node(each)
+        each for each in names if not is_hidden_node(each) and not tolerating_pattern(each)
     )
     for name in sorted(present - set(before)):
         emit(NodeJoined(node=name))

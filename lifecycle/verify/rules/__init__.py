@@ -28,11 +28,9 @@ __all__ = ["CHECKS", "RULES", "About", "Heals", "Rule", "rule"]
 _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], ...] = (
     (nodes.RULES, nodes.check),
     (endpoints.RULES, endpoints.check),
-    (endpoints.DEFINITION_RULES, endpoints.check_definitions),
     (nodes.OUTSIDER_RULES, nodes.check_outsiders),
     (qos.RULES, qos.check),
     (matching.RULES, matching.check),
-    (matching.CLIENT_RULES, matching.check_clients),
     (state.RULES, state.check),
     (health.RULES, health.check),
     (state.REPORT_RULES, state.check_reports),
@@ -41,10 +39,7 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (time.RULES, time.check),
     (connections.RULES, connections.check),
     (flows.RULES, flows.check),
-    (flows.TRANSPORT_RULES, flows.check_transport),
-    (flows.DSCP_RULES, flows.check_dscp),
     (measured.RULES, measured.check),
-    (measured.MARK_RULES, measured.check_marks),
 )
 
 RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *run.RULES)

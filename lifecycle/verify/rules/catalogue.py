@@ -7,6 +7,7 @@ rules and does not parse ids, subjects or messages. Pure.
 from __future__ import annotations
 
 import enum
+import functools
 
 import msgspec
 
@@ -15,7 +16,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Actual
+from lifecycle.verify.view import Actual, FlowView
 
 
 class Heals(enum.Enum):
@@ -41,8 +42,8 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         id: `family.name`, stable for ever; a section of docs/rules.md.
         meaning: what a finding of it says, one line.
-        outcomes: the outcomes that it can have besides ok.
         fix: what to do about it, one line.
+        outcomes: the outcomes that it can have besides ok.
         concerns_flow: a finding on an endpoint also spoils the flows of that endpoint.
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
@@ -60,8 +61,8 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     id: str
     meaning: str
-    outcomes: tuple[Outcome, ...]
     fix: str
+    outcomes: tuple[Outcome, ...] = (Outcome.VIOLATED,)
     concerns_flow: bool = False
     may_block: bool = True
     heals: Heals = Heals.WITH_CHANGE
@@ -119,7 +120,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     def on(
         self,
-        what: PlannedNode | Actual,
+        what: PlannedNode | Actual | FlowView,
         *,
         expected: str,
         observed: str,
@@ -127,17 +128,19 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
         outcome: Outcome | None = None,
         hint: str = "",
     ) -> Finding:
-        """Make a finding on a declared node or endpoint, at its declaration; as `finding`."""
-        node = what if isinstance(what, PlannedNode) else what.node
-        planned = None if isinstance(what, PlannedNode) else what.planned
-        return self.finding(
-            subject=node.full_name if planned is None else planned.resolved,
+        """Make a finding on a declared node, endpoint or flow, at its declaration; as `finding`."""
+        found = functools.partial(
+            self.finding,
             expected=expected,
             observed=observed,
             message=message,
             outcome=outcome,
-            at=node.at if planned is None else planned.at,
-            node=node.full_name,
-            endpoint=None if planned is None else planned.kind,
             hint=hint,
+            at=what.at,
         )
+        if isinstance(what, FlowView):
+            return found(subject=what.subject, ends=what.ends)
+        if isinstance(what, PlannedNode):
+            return found(subject=what.full_name, node=what.full_name)
+        planned = what.planned
+        return found(subject=planned.resolved, node=what.node.full_name, endpoint=planned.kind)

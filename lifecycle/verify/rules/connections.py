@@ -6,6 +6,7 @@ but neither its connection URLs nor why it could not connect. So the nodes' repo
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
@@ -16,41 +17,28 @@ from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, NodeFacts, View, connection_of
 
-MISSING = Rule(
+_rule = functools.partial(Rule, concerns_flow=True, about=About.CONNECTION, heals=Heals.WITH_TIME)
+
+MISSING = _rule(
     id="connection.missing",
     meaning="a planned connection of a node does not exist",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="see who was to make it: the node at connect, or the supervisor by connect_to",
-    concerns_flow=True,
-    about=About.CONNECTION,
-    heals=Heals.WITH_TIME,
 )
-FAILED = Rule(
+FAILED = _rule(
     id="connection.failed",
     meaning="a node reports that it could not make a connection",
-    outcomes=(Outcome.VIOLATED,),
     fix="read the reason: addresses and ports of a URL must be free on the node's own machine",
-    concerns_flow=True,
-    about=About.CONNECTION,
-    heals=Heals.WITH_TIME,
 )
-DIFFERS = Rule(
+DIFFERS = _rule(
     id="connection.differs",
     meaning="a connection was made to other URLs than planned",
-    outcomes=(Outcome.VIOLATED,),
     fix="see who called connect_to; disconnect it, and let its authority make it again",
-    concerns_flow=True,
-    about=About.CONNECTION,
-    heals=Heals.WITH_TIME,
 )
-WRONG_MAPPING = Rule(
+WRONG_MAPPING = _rule(
     id="connection.wrong-mapping",
     meaning="an endpoint is mapped onto another connection than planned",
-    outcomes=(Outcome.VIOLATED,),
     fix="see who called map_to; map it back, or change the node's `connections`",
-    concerns_flow=True,
-    about=About.CONNECTION,
-    heals=Heals.WITH_TIME,
 )
 RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 

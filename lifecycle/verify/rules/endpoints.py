@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
@@ -23,7 +22,6 @@ from lifecycle.verify.view import Actual, SeenEndpoint, View
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
     meaning="a declared endpoint is not in the graph",
-    outcomes=(Outcome.VIOLATED,),
     fix="compare the declared name, remaps and namespace with what the node creates",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
@@ -33,14 +31,12 @@ MISSING_ENDPOINT = Rule(
 TYPE_MISMATCH = Rule(
     id="graph.type-mismatch",
     meaning="an endpoint has another type than declared, or than others of its name",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the type in the manifest or in the node; DDS never matches two types",
     concerns_flow=True,
 )
 ENDPOINT_ERROR = Rule(
     id="endpoint.error",
     meaning="a node reports that it could not make an endpoint as asked",
-    outcomes=(Outcome.VIOLATED,),
     fix="read the reason: it is the middleware's own",
     concerns_flow=True,
 )
@@ -59,23 +55,14 @@ UNDECLARED = {
         meaning=f"a declared node has {'an' if kind.noun.startswith('a') else 'a'} {kind.noun}"
         " that the manifest does not declare"
         + (", or a tool has one under a declared name" if kind.offers else ""),
-        outcomes=(Outcome.VIOLATED,),
         fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
     )
     for kind in EndpointKind
 }
 
-RULES = (
-    MISSING_ENDPOINT,
-    UNSEEN_ENDPOINT,
-    *UNDECLARED.values(),
-    TYPE_MISMATCH,
-    ENDPOINT_ERROR,
-)
-
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge the existence and the type of endpoints."""
+    """Judge the existence, the type, and the definition of the type of endpoints."""
     known: Counter[tuple[str, EndpointKind | None]] = Counter()
     if any(actual.unseen for actual in view.actual):
         known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
@@ -86,6 +73,7 @@ def check(view: View) -> Iterator[Finding]:
                 yield from _unseen(view, actual, known)
     yield from _undeclared(view)
     yield from _conflicts(view)
+    yield from _definitions(view)
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
@@ -172,8 +160,8 @@ def _undeclared(view: View) -> Iterator[Finding]:
             and each.planned.type == endpoint.type
             and each.observed is None
         ]
-        hint = _given_name(view, endpoint)
-        if not hint and len(similar) == 1:
+        hint = ""
+        if len(similar) == 1:
             hint = f"{similar[0].resolved} of the same type is missing: is a remap or a name wrong?"
         yield UNDECLARED[endpoint.kind].finding(
             subject=endpoint.name,
@@ -208,20 +196,6 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
                 f" {endpoint.type or 'of unknown type'}",
             )
     return None
-
-
-def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
-    """Explain a name that a declared endpoint was given while it ran; empty if it was not."""
-    for actual in view.nodes[endpoint.node].actual:
-        report = actual.report
-        if report is None or report.kind is not endpoint.kind:
-            continue
-        if endpoint.name == report.resolved != actual.planned.resolved:
-            return (
-                f"it is {report.kind.value}/{report.name} under another name: is a remap wrong, or"
-                f" was {endpoint.node}/remap called?"
-            )
-    return ""
 
 
 def _conflicts(view: View) -> Iterator[Finding]:
@@ -261,65 +235,55 @@ DEFINITION_DIFFERS = Rule(
     fix="build both ends from one version of the interface package, and install the same here",
     concerns_flow=True,
 )
-DEFINITION_RULES = (DEFINITION_DIFFERS,)
+RULES = (
+    *(MISSING_ENDPOINT, UNSEEN_ENDPOINT, *UNDECLARED.values()),
+    *(TYPE_MISMATCH, ENDPOINT_ERROR, DEFINITION_DIFFERS),
+)
 
 
 _Place = tuple[str, str, str]
 """What ends meet in, its name, and their type."""
 
 
-def check_definitions(view: View) -> Iterator[Finding]:
+def _definitions(view: View) -> Iterator[Finding]:
     """Compare the ends of everything that is declared, with what is installed or each other."""
     installed = {_place(each.planned): each.planned.type_hash for each in view.actual}
-    unknown: dict[str, list[tuple[_Place, _End]]] = {}
+    unknown: dict[str, list[SeenEndpoint]] = {}
+    differing: dict[Finding, None] = {}
     for place, ends in _ends(view).items():
         if place not in installed:
             continue  # nothing of the plan meets there, or its type is wrong: that is said
         expected, source = installed[place], "the definition installed here"
         if not expected:
             # A stranger that differs is at fault itself, so declared ends come first.
-            by_right = sorted(ends, key=lambda end: end.at is None)
+            by_right = sorted(ends, key=lambda end: end.planned is None)
             first = next((end for end in by_right if end.type_hash), None)
             if first is None:
                 continue  # nothing to compare with
             expected, source = first.type_hash or "", first.node or "an unknown node"
-        for end in dict.fromkeys(ends):
+        for end in ends:
             if end.type_hash == "":
-                unknown.setdefault(end.node, []).append((place, end))
+                unknown.setdefault(end.node, []).append(end)
             elif end.type_hash is not None and differ(end.type_hash, expected):
-                yield _differs(place, end, expected, source)
+                differing[_differs(end, expected, source)] = None
+    yield from differing
     for node in sorted(unknown):
         yield _unverifiable(node, unknown[node])
 
 
-class _End(NamedTuple):
-    """What counts of an end: `type_hash` as `ObservedEndpoint` has it; its declaration, if any."""
-
-    kind: EndpointKind
-    node: str
-    type_hash: str | None
-    at: Position | None
-
-
-def _ends(view: View) -> dict[_Place, list[_End]]:
+def _ends(view: View) -> dict[_Place, list[SeenEndpoint]]:
     """Return the ends of all topics, services and actions by where they meet.
 
     Those of topics come first, by topic, then those of services and actions.
     """
-    found: dict[_Place, list[_End]] = {}
-
-    def add(end: SeenEndpoint | ObservedEndpoint, planned: PlannedEndpoint | None) -> None:
-        at = planned.at if planned else None
-        found.setdefault(_place(end), []).append(_End(end.kind, end.node, end.type_hash, at))
-
-    for seen in view.seen:
-        add(seen, seen.planned)
-    for actual in view.actual:
-        if actual.observed is not None and not actual.observed.kind.is_topic:
-            add(actual.observed, actual.planned)
-    for each in (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed):
-        if not each.kind.is_topic:
-            add(each, None)
+    others = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
+    services = (
+        *(each.end for each in view.actual if each.observed is not None),
+        *map(SeenEndpoint.of, others),
+    )
+    found: dict[_Place, list[SeenEndpoint]] = {}
+    for end in (*view.seen, *(each for each in services if not each.kind.is_topic)):
+        found.setdefault(_place(end), []).append(end)
     return found
 
 
@@ -336,13 +300,17 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _place(end: SeenEndpoint | ObservedEndpoint | PlannedEndpoint) -> _Place:
+def _place(end: SeenEndpoint | PlannedEndpoint) -> _Place:
     name = end.resolved if isinstance(end, PlannedEndpoint) else end.name
     return end.kind.meets_in, name, end.type
 
 
-def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
-    what, name, type_ = place
+def _at(end: SeenEndpoint) -> Position | None:
+    return end.planned.at if end.planned else None
+
+
+def _differs(end: SeenEndpoint, expected: str, source: str) -> Finding:
+    what, name, type_ = _place(end)
     node = end.node or "an unknown node"
     return DEFINITION_DIFFERS.finding(
         outcome=Outcome.VIOLATED,
@@ -352,16 +320,16 @@ def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
         message=f"the {end.kind.noun} of {name} in {node} has another definition: its {type_} is"
         f" not that of {source}; both have the name, so the {what} is matched and the data are not"
         " understood",
-        at=end.at,
+        at=_at(end),
         node=end.node,
         endpoint=end.kind,
     )
 
 
-def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
+def _unverifiable(node: str, ends: list[SeenEndpoint]) -> Finding:
     """One finding for a node: who announces no hash announces none for any of its endpoints."""
     who = node or "an unknown node"
-    listed = ", ".join(dict.fromkeys(f"{name} ({end.kind.noun})" for (_, name, _), end in ends))
+    listed = ", ".join(dict.fromkeys(f"{end.name} ({end.kind.noun})" for end in ends))
     return DEFINITION_DIFFERS.finding(
         outcome=Outcome.UNVERIFIABLE,
         subject=who,
@@ -369,7 +337,7 @@ def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
         observed="none announced",
         message=f"nothing shows which definitions {who} uses on {listed}: it announces no type"
         " hashes",
-        at=next((end.at for _, end in ends if end.at), None),
+        at=next(filter(None, map(_at, ends)), None),
         node=node,
         hint="ROS 2 announces them since Iron; run the node under a newer one, or accept the gap",
     )

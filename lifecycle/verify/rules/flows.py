@@ -39,7 +39,6 @@ from lifecycle.verify.view import Actual, FlowView, View, connection_of
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
     meaning="an endpoint or a link needs a unique network flow and does not have it",
-    outcomes=(Outcome.VIOLATED,),
     fix="ask for `unique:` on the endpoint itself, so that it gets sockets of its own; see"
     " `lifecycle flows`",
     concerns_flow=True,
@@ -47,7 +46,6 @@ NOT_UNIQUE = Rule(
 UNVERIFIABLE = Rule(
     id="flow.unverifiable",
     meaning="a unique network flow is strictly required or demanded and cannot be proven",
-    outcomes=(Outcome.VIOLATED,),
     fix="run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
     " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`",
     concerns_flow=True,
@@ -57,16 +55,14 @@ UNVERIFIABLE = Rule(
 BROKEN_ENDPOINT = Rule(
     id="flow.broken-endpoint",
     meaning="a subscription has no network flow endpoint at all, so nothing can reach it",
-    outcomes=(Outcome.VIOLATED,),
     fix="look for two processes with the same fixed ports, or an interface whitelist that matches"
     " no interface",
     concerns_flow=True,
 )
-RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT)
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every strict endpoint, then every link's demand."""
+    """Judge every strict endpoint, then every link's demand; then media, then marks."""
     for actual in view.actual:
         yield from _broken(actual)
         if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
@@ -74,6 +70,12 @@ def check(view: View) -> Iterator[Finding]:
     for flow in view.flows:
         if flow.planned.unique is not UniqueHow.NOT:
             yield from _demanded(flow, view.uniqueness)
+    for flow in view.flows:
+        if flow.publishers and flow.subscriptions and not is_missing(flow):
+            yield from _judge_transport(view, flow)
+    for actual in view.actual:
+        if actual.observed is not None or actual.report is not None:
+            yield from _judge_dscp(actual)
 
 
 def is_missing(flow: FlowView) -> bool:
@@ -138,14 +140,12 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     observed = f"publisher {_answer(publisher)}, subscription {_answer(subscription)}"
     unproven = ", which is not proven" if met is None else ""
     rule = UNVERIFIABLE if met is None else NOT_UNIQUE
-    yield rule.finding(
-        subject=flow.subject,
-        ends=flow.ends,
+    yield rule.on(
+        flow,
         expected=f"{how} unique flow",
         observed=observed,
         message=f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic} is not as"
         f" its link demands, a {how} unique flow{unproven}; {observed}",
-        at=flow.at,
     )
 
 
@@ -164,11 +164,9 @@ def _answer(unique: bool | None) -> str:
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
     """Spell an NFE for people: `udp 10.0.0.1:7412`, `shm`."""
-    if nfe.transport_protocol is TransportProtocol.UNKNOWN:
-        return nfe.medium
-    address = nfe.internet_address
-    host = f"[{address}]" if ":" in address else address
-    return f"{nfe.transport_protocol.value} {host}:{nfe.transport_port}"
+    protocol = nfe.transport_protocol
+    known = f"{protocol.value} " if protocol is not TransportProtocol.UNKNOWN else ""
+    return known + nfe.describe()
 
 
 WRONG_TRANSPORT = Rule(
@@ -188,20 +186,11 @@ WRONG_MEDIUM = Rule(
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
 )
-TRANSPORT_RULES = (WRONG_TRANSPORT, WRONG_MEDIUM)
-
 _WORDS = {
     **{each.value: each.meaning for each in Medium},
     NONE: "no transport that both have",
     UNKNOWN: "not known",
 }
-
-
-def check_transport(view: View) -> Iterator[Finding]:
-    """Judge every flow that must be carried by something."""
-    for flow in view.flows:
-        if flow.publishers and flow.subscriptions and not is_missing(flow):
-            yield from _judge_transport(view, flow)
 
 
 def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
@@ -245,16 +234,14 @@ def _otherwise(flow: FlowView, used: str) -> Finding:
     unknown = used == UNKNOWN
     planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
     word = _WORDS[used]
-    return WRONG_MEDIUM.finding(
+    return WRONG_MEDIUM.on(
+        flow,
         outcome=Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
-        subject=flow.subject,
-        ends=flow.ends,
         expected=planned,
         observed=word,
         message=f"what carries {flow.publisher} →"
         f" {flow.subscription} on {flow.planned.topic} must be {planned}, and"
         f" {'nothing shows what it is' if unknown else f'is {word}'}",
-        at=flow.at,
     )
 
 
@@ -273,38 +260,35 @@ DSCP_UNVERIFIABLE = Rule(
     fix="only nodes in our host mark and read back; mark a foreign node's flow in the network",
     concerns_flow=True,
 )
-DSCP_RULES = (DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE)
+RULES = (
+    *(NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT),
+    *(WRONG_TRANSPORT, WRONG_MEDIUM),
+    *(DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE),
+)
 
 
-def check_dscp(view: View) -> Iterator[Finding]:
-    """Judge every endpoint that declares a DSCP and is there.
-
-    A subscription's is that of its acknowledgements.
-    """
-    for actual in view.actual:
-        planned, node, report = actual.planned, actual.node, actual.report
-        wanted = planned.dscp
-        if wanted is None:
-            continue
-        if actual.observed is None and report is None:
-            continue
-        where = f"the {planned.kind.noun} of {planned.resolved} in {node.full_name}"
-        read = report.dscp if report else None
-        if read is None:
-            yield DSCP_UNVERIFIABLE.on(
-                actual,
-                expected=describe(wanted),
-                observed="not read back",
-                message=f"nothing shows the DSCP of {where}: it was not read back",
-            )
-        elif read != wanted:
-            waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
-            yield DSCP_NOT_APPLIED.on(
-                actual,
-                outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
-                expected=describe(wanted),
-                observed=describe(read),
-                message=f"the sockets of {where} carry {describe(read)}"
-                f" and not {describe(wanted)}{waived}",
-                hint="" if planned.enforce_dscp else "see the node's log for the refused option",
-            )
+def _judge_dscp(actual: Actual) -> Iterator[Finding]:
+    """Judge the DSCP of an endpoint; a subscription's is that of its acknowledgements."""
+    planned, report = actual.planned, actual.report
+    wanted, read = planned.dscp, report.dscp if report else None
+    if wanted is None:
+        return
+    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node.full_name}"
+    if read is None:
+        yield DSCP_UNVERIFIABLE.on(
+            actual,
+            expected=describe(wanted),
+            observed="not read back",
+            message=f"nothing shows the DSCP of {where}: it was not read back",
+        )
+    elif read != wanted:
+        waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
+        yield DSCP_NOT_APPLIED.on(
+            actual,
+            outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
+            expected=describe(wanted),
+            observed=describe(read),
+            message=f"the sockets of {where} carry {describe(read)}"
+            f" and not {describe(wanted)}{waived}",
+            hint="" if planned.enforce_dscp else "see the node's log for the refused option",
+        )

@@ -25,7 +25,6 @@ UNHEALTHY = Rule(
 NOT_ASKED = Rule(
     id="node.without-health",
     meaning="a node is to be asked whether it is healthy, and its class has no `health` method",
-    outcomes=(Outcome.VIOLATED,),
     fix="give its class a method 'health', or write 'health: {diagnostics: NAME}'",
 )
 RULES = (UNHEALTHY, NOT_ASKED)

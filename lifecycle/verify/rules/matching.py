@@ -15,6 +15,7 @@ reports nothing about its clients.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -34,32 +35,30 @@ from lifecycle.verify.view import (
     brings_up,
 )
 
-UNMATCHED_LINK = Rule(
-    id="graph.unmatched-link",
-    meaning="the two ends of a declared link are not matched",
+_rule = functools.partial(
+    Rule,
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
-    fix="see the other findings on its ends; if there are none, look at the network between them",
-    concerns_flow=True,
     about=About.MATCH,
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
     absence="match",
 )
-UNMATCHED_FLOW = Rule(
+
+UNMATCHED_LINK = _rule(
+    id="graph.unmatched-link",
+    meaning="the two ends of a declared link are not matched",
+    fix="see the other findings on its ends; if there are none, look at the network between them",
+    concerns_flow=True,
+)
+UNMATCHED_FLOW = _rule(
     id="graph.unmatched-flow",
     meaning="a declared publisher and a declared subscription of its topic are not matched",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the network between the two: discovery range, multicast, firewall, peers",
     concerns_flow=True,
-    about=About.MATCH,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
-    absence="match",
 )
 UNKNOWN_PEER = Rule(
     id="graph.unknown-peer",
     meaning="a declared endpoint is matched with more peers than the graph shows",
-    outcomes=(Outcome.VIOLATED,),
     fix="look for a participant that is found by the node's addresses alone (initial peers, a"
     " discovery server) and not by the supervisor; give the system a domain of its own",
     concerns_flow=True,
@@ -72,9 +71,6 @@ UNREPORTED_FLOW = Rule(
     fix="run one of its nodes in our host (`run: python`), or write it under `policy.trust`",
     heals=Heals.WITH_TIME,
 )
-RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW)
-
-
 Match = tuple[Outcome, str]
 """What is known of a pair, and why it is not ok."""
 
@@ -136,7 +132,7 @@ def match(
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every planned flow, then every end that reports how many peers it has."""
+    """Judge every planned flow, every end that reports how many peers it has, every client."""
     topics: dict[str, _Ends] = {}
     for each in (*view.seen, *view.seen_of_tools):
         publishers, subscriptions = topics.setdefault(each.name, ([], []))
@@ -145,6 +141,7 @@ def check(view: View) -> Iterator[Finding]:
         yield from _judge_flow(flow, topics.get(flow.planned.topic, _NO_ENDS))
     yield from _unknown_peers(view, topics)
     yield from _unreported_flows(view)
+    yield from _clients(view)
 
 
 def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]:
@@ -226,16 +223,14 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
     violated = outcome is Outcome.VIOLATED
     pair = f"{flow.publisher} → {flow.subscription}"
-    yield rule.finding(
+    yield rule.on(
+        flow,
         outcome=outcome,
-        subject=flow.subject,
-        ends=flow.ends,
         expected="matched",
         observed=reason,
         message=f"{pair} are not matched on {flow.planned.topic}: {reason}"
         if violated
         else f"nothing proves that {pair} are matched on {flow.planned.topic}: {reason}",
-        at=flow.at,
     )
 
 
@@ -304,17 +299,12 @@ def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEnd
     ]
 
 
-UNMATCHED_CLIENT = Rule(
+UNMATCHED_CLIENT = _rule(
     id="graph.unmatched-client",
     meaning="a declared client and a declared server of its service or action are not matched",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the QoS of both ends, and at the network between the two",
-    about=About.MATCH,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
-    absence="match",
 )
-CLIENT_RULES = (UNMATCHED_CLIENT,)
+RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW, UNMATCHED_CLIENT)
 
 _Place = tuple[EndpointKind, str, str]
 """Kind, name and type."""
@@ -326,7 +316,7 @@ SERVER_OF = {
 _SERVERS = frozenset(SERVER_OF.values())
 
 
-def check_clients(view: View) -> Iterator[Finding]:
+def _clients(view: View) -> Iterator[Finding]:
     """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
     for actual in view.actual:

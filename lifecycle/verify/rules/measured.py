@@ -36,7 +36,7 @@ PROBATION_S = 10.0
 _FIVE_QI_QUANTILE = 0.98
 _DELAYS = frozenset({Kind.DELAY, Kind.NETWORK_DELAY})
 
-_rule = functools.partial(Rule, outcomes=(Outcome.VIOLATED,), heals=Heals.WITH_TIME, measured=True)
+_rule = functools.partial(Rule, heals=Heals.WITH_TIME, measured=True)
 
 DELAY = _rule(
     id="flow.delay",
@@ -87,8 +87,8 @@ DSCP_LOST = Rule(
     heals=Heals.WITH_TIME,
     measured=True,
 )
-RULES = (DELAY, RATE, LOSS, SILENT, NOT_MEASURED, NOTHING_ARRIVED)
-MARK_RULES = (DSCP_LOST,)
+OF_NUMBERS = (DELAY, RATE, LOSS, SILENT, NOT_MEASURED, NOTHING_ARRIVED)
+RULES = (*OF_NUMBERS, DSCP_LOST)
 
 _RULES = {
     Kind.DELAY: DELAY,
@@ -244,9 +244,10 @@ def check(view: View) -> Iterator[Finding]:
                 yield each.not_measured(quantity, why)
         if _is_active(view, each.flow):
             yield from _judged(view, each)
+    yield from _marks(view)
 
 
-def check_marks(view: View) -> Iterator[Finding]:
+def _marks(view: View) -> Iterator[Finding]:
     """Judge with what DSCP arrives what is sent beside each flow from another host to this one."""
     for flow in view.flows if view.marks else ():
         publisher, subscriber = (each.node for each in flow.nodes)
@@ -260,15 +261,13 @@ def check_marks(view: View) -> Iterator[Finding]:
             known = arrives_as is not None
             observed = "nothing" if arrives_as is None else describe(arrives_as)
             what = f"what {publisher.machine} sends as {describe(dscp)} beside the flow"
-            yield DSCP_LOST.finding(
+            yield DSCP_LOST.on(
+                flow,
                 outcome=Outcome.VIOLATED if known else Outcome.UNVERIFIABLE,
-                subject=flow.subject,
                 expected=describe(dscp),
                 observed=observed,
                 message=f"{what} {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
                 + (f" arrives as {observed}" if known else " does not arrive"),
-                at=flow.at,
-                ends=flow.ends,
             )
 
 

@@ -34,14 +34,12 @@ MISSING_NODE = Rule(
 UNDECLARED_NODE = Rule(
     id="graph.undeclared-node",
     meaning="the graph has a node that the manifest does not declare",
-    outcomes=(Outcome.VIOLATED,),
     fix="declare it, stop it, give the system a domain of its own, or set"
     " policy.undeclared_nodes: open",
 )
 DUPLICATE_NODE = Rule(
     id="graph.duplicate-node",
     meaning="several nodes carry one fully qualified name",
-    outcomes=(Outcome.VIOLATED,),
     fix="stop the other one, or give each its own name or namespace",
 )
 ENDED_NODE = Rule(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Position
@@ -18,32 +19,27 @@ from lifecycle.verify.view import NodeFacts, View
 MISSING = Rule(
     id="param.missing",
     meaning="a node does not have a parameter that is declared or given",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the name, or have the node declare it; a value for none has no effect",
     heals=Heals.WITH_TIME,
 )
 TYPE_DIFFERS = Rule(
     id="param.type-differs",
     meaning="a parameter has another type than is declared or given",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the declaration, or the node; ROS converts nothing, 1 is no double",
 )
 VALUE_DIFFERS = Rule(
     id="param.value-differs",
     meaning="a parameter has another value than the manifest gives or declares as its default",
-    outcomes=(Outcome.VIOLATED,),
     fix="give the value that is meant, in the manifest or with `ros2 param set`",
 )
 READ_ONLY_DIFFERS = Rule(
     id="param.read-only-differs",
     meaning="a parameter that is declared read_only can be set while the node runs",
-    outcomes=(Outcome.VIOLATED,),
     fix="have the node declare it read-only, or remove read_only from the interface",
 )
 UNDECLARED = Rule(
     id="param.undeclared",
     meaning="a declared node has parameters that its interface does not declare",
-    outcomes=(Outcome.VIOLATED,),
     fix="declare them in the node's interface, remove them, or set `endpoints: open` on the node",
 )
 UNVERIFIABLE = Rule(
@@ -143,23 +139,24 @@ def _judge(
     node: PlannedNode, expected: ExpectedParameter, actual: ParameterReport | None
 ) -> Iterator[Finding]:
     what = f"parameter {expected.name} of node {node.full_name}"
+    place: dict[str, Any] = {
+        "subject": f"{node.full_name}: {expected.name}",
+        "at": expected.at,
+        "node": node.full_name,
+    }
     if actual is None:
         if not expected.optional:
-            yield _finding(
-                MISSING,
-                node,
-                expected,
-                wanted=_wanted(expected),
+            yield MISSING.finding(
+                **place,
+                expected=_wanted(expected),
                 observed="no such parameter",
                 message=f"there is no {what}, which is {_origin(expected)}",
             )
         return
     if not _is_of_type(actual, expected.type):
-        yield _finding(
-            TYPE_DIFFERS,
-            node,
-            expected,
-            wanted=expected.type,
+        yield TYPE_DIFFERS.finding(
+            **place,
+            expected=expected.type,
             observed=actual.type or "not set",
             message=f"{what} is {_with_type(actual)}, and must be "
             f"{expected.type} as {_origin(expected)}",
@@ -169,21 +166,17 @@ def _judge(
         hint = ""
         if expected.source == DEFAULT:
             hint = "give the value that is meant under `parameters`, or correct the default"
-        yield _finding(
-            VALUE_DIFFERS,
-            node,
-            expected,
-            wanted=wanted,
+        yield VALUE_DIFFERS.finding(
+            **place,
+            expected=wanted,
             observed=_value_of(actual),
             message=f"{what} is {_value_of(actual)}, and must be {wanted} as {_origin(expected)}",
             hint=hint,
         )
     if expected.read_only and not actual.read_only:
-        yield _finding(
-            READ_ONLY_DIFFERS,
-            node,
-            expected,
-            wanted="read_only",
+        yield READ_ONLY_DIFFERS.finding(
+            **place,
+            expected="read_only",
             observed="can be set",
             message=f"{what} can be set, and must be read_only as its interface declares it",
         )
@@ -204,27 +197,6 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
             observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
             message=f"the interface of node {node.full_name} does not declare {_listed(names)}",
         )
-
-
-def _finding(
-    rule: Rule,
-    node: PlannedNode,
-    expected: ExpectedParameter,
-    *,
-    wanted: str,
-    observed: str,
-    message: str,
-    hint: str = "",
-) -> Finding:
-    return rule.finding(
-        subject=f"{node.full_name}: {expected.name}",
-        expected=wanted,
-        observed=observed,
-        message=message,
-        at=expected.at,
-        node=node.full_name,
-        hint=hint,
-    )
 
 
 def _unknown(node: PlannedNode, why: str) -> Finding:

@@ -31,7 +31,6 @@ from lifecycle.verify.view import (
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",
     meaning="an endpoint's QoS is not the declared one",
-    outcomes=(Outcome.VIOLATED,),
     fix="correct the profile in the manifest or in the node; look for an XML profile or a"
     " qos_overrides parameter",
 )

@@ -12,53 +12,45 @@ from lifecycle.verify.rules.catalogue import About, Heals, Rule
 PROCESS_DIED = Rule(
     id="run.process-died",
     meaning="a process of the system ended although nobody asked it to, or died when asked to",
-    outcomes=(Outcome.VIOLATED,),
     fix="look at the last lines of its log",
     names_log=True,
 )
 GAVE_UP = Rule(
     id="run.gave-up",
     meaning="a process failed too often to be started again",
-    outcomes=(Outcome.VIOLATED,),
     fix="see what it failed of each time, in the message and in its log",
     names_log=True,
 )
 START_FAILED = Rule(
     id="run.start-failed",
     meaning="a process or node could not be started",
-    outcomes=(Outcome.VIOLATED,),
     fix="look at its `run` entry and at the last lines of its log",
     names_log=True,
 )
 TRANSITION_FAILED = Rule(
     id="run.transition-failed",
     meaning="a node refused or failed a transition",
-    outcomes=(Outcome.VIOLATED,),
     fix="look at the reason, and at the traceback in the node's log",
     names_log=True,
 )
 DEADLINE = Rule(
     id="run.deadline",
     meaning="a step, or the whole bring-up, took longer than it may",
-    outcomes=(Outcome.VIOLATED,),
     fix="see what it waited for; raise the node's `timeouts` or `--timeout` if it needs longer",
 )
 NOT_PROGRAMMED = Rule(
     id="run.not-programmed",
     meaning="a network could not be programmed with the verified flows",
-    outcomes=(Outcome.VIOLATED,),
-    fix="see which privilege, program or server is missing; `lifecycle flows apply` tries it alone",
+    fix="see which privilege, program or server is missing; `flows apply --dry-run` tries it alone",
 )
 NOT_WIRED = Rule(
     id="run.not-wired",
     meaning="a connection or a mapping could not be made, or made again",
-    outcomes=(Outcome.VIOLATED,),
     fix="the message names node, connection, endpoint and the node's own reason",
 )
 SILENT_NODE = Rule(
     id="run.silent-node",
     meaning="a node was stopped, hangs in a callback, or cannot be reached any more",
-    outcomes=(Outcome.VIOLATED,),
     fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
@@ -74,7 +66,6 @@ NOT_ANSWERING = Rule(
 PLANS_DIFFER = Rule(
     id="run.plans-differ",
     meaning="the supervisor of another machine planned another system than this one",
-    outcomes=(Outcome.VIOLATED,),
     fix="give both supervisors the same manifest and arguments, and start them again",
 )
 PLAN_UNKNOWN = Rule(

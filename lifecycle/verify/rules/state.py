@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import TargetState
@@ -11,32 +12,23 @@ from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import NodeFacts, View, brings_up
 
-WRONG_STATE = Rule(
+_rule = functools.partial(Rule, about=About.PROGRESS, heals=Heals.WITH_TIME, if_undiscovered=True)
+
+WRONG_STATE = _rule(
     id="state.wrong-state",
     meaning="a managed node is not in the state that this stage needs",
-    outcomes=(Outcome.VIOLATED,),
     fix="look at the node's log for the transition that failed, or at who else drives it",
-    about=About.PROGRESS,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
 )
-STATE_UNVERIFIABLE = Rule(
+STATE_UNVERIFIABLE = _rule(
     id="state.unverifiable",
     meaning="a managed node's state could not be learnt",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
-    about=About.PROGRESS,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
 )
-ACTIVATED_AT_CLOSED_GATE = Rule(
+ACTIVATED_AT_CLOSED_GATE = _rule(
     id="state.activated-at-closed-gate",
     meaning="a managed node was activated by its own code or another client at a closed gate",
-    outcomes=(Outcome.VIOLATED,),
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
-    about=About.PROGRESS,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
 
@@ -117,24 +109,16 @@ def _reports_state(facts: NodeFacts) -> bool:
     return facts.is_ours and report is not None and bool(report.state)
 
 
-MISSING_REPORT = Rule(
+MISSING_REPORT = _rule(
     id="config.missing-report",
     meaning="a node of ours did not report its configuration",
-    outcomes=(Outcome.VIOLATED,),
     fix="see whether its ~/get_configuration answers; look at its log",
-    about=About.PROGRESS,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
     absence="report",
 )
-INCOMPLETE_REPORT = Rule(
+INCOMPLETE_REPORT = _rule(
     id="config.incomplete-report",
     meaning="a node of ours does not mention a declared endpoint in its report",
-    outcomes=(Outcome.VIOLATED,),
     fix="the node runs from another manifest, or has not connected: compare and restart it",
-    about=About.PROGRESS,
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
     absence="{kind} in the report of {node}",
 )
 REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)

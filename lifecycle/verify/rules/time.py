@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from lifecycle.manifest.model import SIM_TIME, EndpointKind
 from lifecycle.plan.model import PlannedNode, uses_sim_time
@@ -16,7 +17,6 @@ from lifecycle.verify.view import View
 NO_CLOCK = Rule(
     id="time.no-clock",
     meaning="nodes use simulated time, and nobody publishes /clock",
-    outcomes=(Outcome.VIOLATED,),
     fix="start the simulator or the bag (`ros2 bag play --clock`), or set use_sim_time: false",
     heals=Heals.WITH_TIME,
     absence="publisher of simulated time",
@@ -24,7 +24,6 @@ NO_CLOCK = Rule(
 SEVERAL_CLOCKS = Rule(
     id="time.several-clocks",
     meaning="nodes use simulated time, and /clock has more than one publisher",
-    outcomes=(Outcome.VIOLATED,),
     fix="stop all but one: each makes time jump to its own",
 )
 UNDECLARED_CLOCK = Rule(
@@ -57,9 +56,8 @@ def check(view: View) -> Iterator[Finding]:
     ]
     if len(publishers) > 1:
         owners = ", ".join(sorted(each.node or "an unknown node" for each in publishers))
-        yield _finding(
-            SEVERAL_CLOCKS,
-            users,
+        yield SEVERAL_CLOCKS.finding(
+            **_place(users),
             expected="one publisher",
             observed=f"{len(publishers)} publishers",
             message=f"several nodes give {_named(users)} their time: {owners} publish {topic}",
@@ -67,9 +65,8 @@ def check(view: View) -> Iterator[Finding]:
     elif not publishers:
         # Of a declared one that is missing, or cannot be seen from here, there is a finding.
         if not any(_publishes(node) for node in view.plan.nodes):
-            yield _finding(
-                NO_CLOCK,
-                users,
+            yield NO_CLOCK.finding(
+                **_place(users),
                 expected=f"publisher of {type_}",
                 observed="no publisher",
                 message=f"there is no simulated time for {_named(users)}:"
@@ -82,9 +79,8 @@ def check(view: View) -> Iterator[Finding]:
 def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -> Iterator[Finding]:
     who = publisher.node or "an unknown node"
     if (publisher.node, publisher.kind, publisher.name) not in view.names.ends:
-        yield _finding(
-            UNDECLARED_CLOCK,
-            users,
+        yield UNDECLARED_CLOCK.finding(
+            **_place(users),
             expected="declared publisher",
             observed=f"publisher of {who}",
             message=f"{who} gives {_named(users)} their time on {publisher.name},"
@@ -92,9 +88,8 @@ def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -
         )
     # A managed publisher sends once it is active.
     if publisher.silent and view.stage is Stage.ACTIVE:
-        yield _finding(
-            SILENT_CLOCK,
-            users,
+        yield SILENT_CLOCK.finding(
+            **_place(users),
             expected="time",
             observed="no message",
             message=f"there is no time yet for {_named(users)}:"
@@ -126,18 +121,10 @@ def _named(users: list[PlannedNode]) -> str:
 _NAMED = 4
 
 
-def _finding(
-    rule: Rule, users: list[PlannedNode], *, expected: str, observed: str, message: str
-) -> Finding:
+def _place(users: list[PlannedNode]) -> dict[str, Any]:
+    """Return what findings are about, and where the first of the nodes is given its time."""
     given = next(
         (each.at for node in users for each in node.expected_parameters if each.name == SIM_TIME),
         users[0].at,
     )
-    return rule.finding(
-        subject=CLOCK[0],
-        expected=expected,
-        observed=observed,
-        message=message,
-        at=given,
-        endpoint=EndpointKind.PUBLISHER,
-    )
+    return {"subject": CLOCK[0], "at": given, "endpoint": EndpointKind.PUBLISHER}

@@ -36,6 +36,7 @@ from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedServer,
 )
+from lifecycle.verify.tool_filter import DeclaredNames
 
 QOS = QosProfile()
 MARK = "What goes by the network can be read there. "
@@ -262,7 +263,9 @@ def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_t
             exchange(sending, receiving, wait_until)
 
             def seen() -> bool:
-                _, endpoints = observer.snapshot(declared=("/_in", "/_out"))
+                _, endpoints = observer.snapshot(
+                    names=DeclaredNames(nodes=frozenset({"/_in", "/_out"}))
+                )
                 return {each.node for each in endpoints if each.name == "/flow"} == {
                     "/_in",
                     "/_out",

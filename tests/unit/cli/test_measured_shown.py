@@ -95,7 +95,6 @@ def flow_of(measurement: FlowMeasurement, outcome: Outcome = Outcome.OK) -> Flow
         dscp=46,
         requirement=(UniqueRequirement.NOT_REQUIRED,) * 2,
         demanded=UniqueHow.NOT,
-        transport="udp",
         outcome=outcome,
         effective_transport="udpv4",
     )

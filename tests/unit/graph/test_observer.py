@@ -56,9 +56,9 @@ class FakeGraph:
         self.settling = self
 
     def snapshot(
-        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
+        self, *, names: DeclaredNames = NO_NAMES
     ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
-        self.kept = declared
+        self.kept = names.nodes
         if self.arriving:
             self.nodes = self.arriving.pop(0)
         return self.nodes, self.endpoints

@@ -61,7 +61,6 @@ def report(topic: str = "/robot/video", **rest: object) -> FlowReport:
         dscp=0,
         requirement=(UniqueRequirement.NOT_REQUIRED, UniqueRequirement.NOT_REQUIRED),
         demanded=UniqueHow.NOT,
-        transport="udp",
         outcome=Outcome.OK,
     )
     return replace(ordinary, **rest)

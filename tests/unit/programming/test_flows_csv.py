@@ -25,7 +25,6 @@ VIDEO = FlowReport(
     dscp=46,
     requirement=(UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.NOT_REQUIRED),
     demanded=UniqueHow.WEAKLY,
-    transport="udp",
     outcome=Outcome.OK,
     max_delay_ms=5.0,
     five_qi=85,
@@ -43,7 +42,7 @@ def test_a_flow_is_one_line_with_its_5_tuple_dscp_and_verdict() -> None:
     assert header == ",".join((*COLUMNS, *NUMBERS))
     assert line == (
         "/robot/video,/robot/camera,/viewer,udp,ipv4,0.0.0.0,45000,10.0.0.2,7001,,46,EF,184,"
-        "strongly,weakly,strictly_required,not_required,5,udp,ok,85,"
+        "strongly,weakly,strictly_required,not_required,5,ok,85,"
         '"5QI 85, because",udpv4,,,,,'
     )
     counted = FlowMeasurement(

@@ -58,7 +58,7 @@ def test_what_is_not_verified_is_not_programmed(outcome: Outcome) -> None:
         ({"source": ()}, "its network flow endpoints are not known"),
         ({"destination": ()}, "its network flow endpoints are not known"),
         (
-            {"source": (SHM,), "destination": (SHM,), "transport": "shm"},
+            {"source": (SHM,), "destination": (SHM,)},
             "shared memory: no packet that a network could see",
         ),
         ({"effective_transport": "shm"}, "shared memory: no packet that a network could see"),

@@ -35,7 +35,6 @@ def flow(*addresses: str, carrier: str = "udpv4", dscp: int = EF) -> FlowReport:
         dscp=dscp,
         requirement=(UniqueRequirement.NOT_REQUIRED,) * 2,
         demanded=UniqueHow.NOT,
-        transport="udp",
         outcome=Outcome.OK,
         effective_transport=carrier,
     )

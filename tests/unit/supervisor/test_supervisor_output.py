@@ -92,7 +92,6 @@ FLOW = FlowReport(
     dscp=46,
     requirement=(UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.NOT_REQUIRED),
     demanded=UniqueHow.WEAKLY,
-    transport="shm or udp",
     outcome=Outcome.OK,
     five_qi=85,
     five_qi_reason="the least demanding class",

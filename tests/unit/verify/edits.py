@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import (
-    EndpointReport,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
@@ -18,20 +18,28 @@ from lifecycle.verify.observation import (
 Edit = Callable[[Observation], Observation]
 
 
+def _without(field: str, is_one: Callable[[Any], bool]) -> Edit:
+    return lambda seen: replace(
+        seen, **{field: tuple(each for each in getattr(seen, field) if not is_one(each))}
+    )
+
+
+def _changed(field: str, is_one: Callable[[Any], bool], change: Callable[[Any], Any]) -> Edit:
+    return lambda seen: replace(
+        seen,
+        **{field: tuple(change(each) if is_one(each) else each for each in getattr(seen, field))},
+    )
+
+
 def drop_node(name: str) -> Edit:
     """The node is not in the graph."""
-    return lambda seen: replace(
-        seen, nodes=tuple(each for each in seen.nodes if each.full_name != name)
-    )
+    return _without("nodes", lambda each: each.full_name == name)
 
 
 def change_node(name: str, /, **fields: object) -> Edit:
     """The graph shows the node otherwise."""
-    return lambda seen: replace(
-        seen,
-        nodes=tuple(
-            replace(each, **fields) if each.full_name == name else each for each in seen.nodes
-        ),
+    return _changed(
+        "nodes", lambda each: each.full_name == name, lambda each: replace(each, **fields)
     )
 
 
@@ -42,33 +50,24 @@ def add_node(name: str, /, **fields: object) -> Edit:
 
 def drop_endpoint(kind: EndpointKind, name: str) -> Edit:
     """Discovery does not show the endpoint."""
-    return lambda seen: replace(
-        seen,
-        endpoints=tuple(each for each in seen.endpoints if (each.kind, each.name) != (kind, name)),
-    )
+    return _without("endpoints", lambda each: (each.kind, each.name) == (kind, name))
 
 
 def change_endpoint(kind: EndpointKind, name: str, /, **fields: object) -> Edit:
     """Discovery shows the endpoint otherwise."""
-    return lambda seen: replace(
-        seen,
-        endpoints=tuple(
-            replace(each, **fields) if (each.kind, each.name) == (kind, name) else each
-            for each in seen.endpoints
-        ),
+    return _changed(
+        "endpoints",
+        lambda each: (each.kind, each.name) == (kind, name),
+        lambda each: replace(each, **fields),
     )
 
 
 def change_announced_qos(kind: EndpointKind, name: str, /, **policies: object) -> Edit:
     """Discovery announces other policies."""
-    return lambda seen: replace(
-        seen,
-        endpoints=tuple(
-            replace(each, qos=replace(each.qos, **policies))
-            if (each.kind, each.name) == (kind, name) and each.qos
-            else each
-            for each in seen.endpoints
-        ),
+    return _changed(
+        "endpoints",
+        lambda each: (each.kind, each.name) == (kind, name) and each.qos,
+        lambda each: replace(each, qos=replace(each.qos, **policies)),
     )
 
 
@@ -77,27 +76,19 @@ def add_endpoint(kind: EndpointKind, node: str, name: str, /, **fields: object) 
     fields = {"type": "std_msgs/msg/String", **fields}
     return lambda seen: replace(
         seen,
-        endpoints=(
-            *seen.endpoints,
-            ObservedEndpoint(kind=kind, node=node, name=name, **fields),
-        ),
+        endpoints=(*seen.endpoints, ObservedEndpoint(kind=kind, node=node, name=name, **fields)),
     )
 
 
 def drop_report(name: str) -> Edit:
     """The node does not report."""
-    return lambda seen: replace(
-        seen, configurations=tuple(each for each in seen.configurations if each.name != name)
-    )
+    return _without("configurations", lambda each: each.name == name)
 
 
 def change_configuration(name: str, /, **fields: object) -> Edit:
     """The node reports otherwise."""
-    return lambda seen: replace(
-        seen,
-        configurations=tuple(
-            replace(each, **fields) if each.name == name else each for each in seen.configurations
-        ),
+    return _changed(
+        "configurations", lambda each: each.name == name, lambda each: replace(each, **fields)
     )
 
 
@@ -106,51 +97,37 @@ def add_configuration(configuration: NodeConfiguration) -> Edit:
     return lambda seen: replace(seen, configurations=(*seen.configurations, configuration))
 
 
-def _change_reports(
-    kind: EndpointKind,
-    resolved: str,
-    change: Callable[[EndpointReport], tuple[EndpointReport, ...]],
-) -> Edit:
-    def edit(seen: Observation) -> Observation:
-        return replace(
-            seen,
-            configurations=tuple(
-                replace(
-                    each,
-                    endpoints=tuple(
-                        changed
-                        for report in each.endpoints
-                        for changed in (
-                            change(report)
-                            if (report.kind, report.resolved) == (kind, resolved)
-                            else (report,)
-                        )
-                    ),
-                )
-                for each in seen.configurations
-            ),
-        )
-
-    return edit
+def _of_every_report(edit: Callable[[Any], Any]) -> Edit:
+    return _changed("configurations", lambda _: True, edit)
 
 
 def change_report(kind: EndpointKind, resolved: str, /, **fields: object) -> Edit:
     """The node reports the endpoint otherwise."""
-    return _change_reports(kind, resolved, lambda report: (replace(report, **fields),))
+    return _of_every_report(
+        _changed(
+            "endpoints",
+            lambda each: (each.kind, each.resolved) == (kind, resolved),
+            lambda each: replace(each, **fields),
+        )
+    )
 
 
 def change_reported_qos(kind: EndpointKind, resolved: str, /, **policies: object) -> Edit:
     """The node reports other policies."""
-    return _change_reports(
-        kind,
-        resolved,
-        lambda report: (replace(report, qos=replace(report.qos, **policies)),),
+    return _of_every_report(
+        _changed(
+            "endpoints",
+            lambda each: (each.kind, each.resolved) == (kind, resolved),
+            lambda each: replace(each, qos=replace(each.qos, **policies)),
+        )
     )
 
 
 def drop_endpoint_report(kind: EndpointKind, resolved: str) -> Edit:
     """The node's report does not mention the endpoint."""
-    return _change_reports(kind, resolved, lambda _: ())
+    return _of_every_report(
+        _without("endpoints", lambda each: (each.kind, each.resolved) == (kind, resolved))
+    )
 
 
 def both(*edits: Edit) -> Edit:
@@ -162,3 +139,7 @@ def both(*edits: Edit) -> Edit:
         return seen
 
     return edit
+
+
+unchanged = both()
+"""Everything is as planned."""

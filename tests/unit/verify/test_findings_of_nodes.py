@@ -11,7 +11,7 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, 
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
-from lifecycle.verify.observation import Identity, NodeConfiguration, Observation
+from lifecycle.verify.observation import Identity, NodeConfiguration
 from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import endpoint, node, planned, publisher, subscription, teleop
@@ -29,6 +29,7 @@ from tests.unit.verify.edits import (
     drop_endpoint_report,
     drop_node,
     drop_report,
+    unchanged,
 )
 from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
@@ -46,10 +47,6 @@ FOREIGN = planned(
     node("talker", publisher("chatter"), run=Run(kind=RunKind.ATTACH)),
     node("listener", subscription("chatter"), run=Run(kind=RunKind.ATTACH), managed=False),
 )
-
-
-def unchanged(seen: Observation) -> Observation:
-    return seen
 
 
 def wired(plan: Plan, key: str, *urls: str) -> Plan:

@@ -68,6 +68,9 @@ REFUSED = {
     "a pid that no integer holds": edited(identity={**GOOD["identity"], "process_id": 10**30}),
     "a negative count of matches": with_endpoint(matched=-1),
     "a DSCP of 64": with_endpoint(dscp=64),
+    "a prefix that is too short": edited(connections=[{"name": "b", "prefix": "a"}]),
+    "a long name of another": edited(name="x" * 200),
+    "a long address that is none": with_endpoint(nfes=[{**NFE, "internet_address": "y" * 200}]),
     "a GID that is no hex": with_endpoint(gid="zz" * 16),
     "a port of 65536": with_endpoint(nfes=[{**NFE, "transport_port": 65536}]),
     "an address that is none": with_endpoint(nfes=[{**NFE, "internet_address": "\x1b[2J"}]),
@@ -91,14 +94,8 @@ def test_what_is_no_configuration_is_refused_in_a_sentence(text: str) -> None:
     assert 0 < len(str(caught.value)) < 300
 
 
-def second(**changes: object) -> str:
-    """The first endpoint is as it should be."""
-    first = GOOD["endpoints"][0]
-    return edited(endpoints=[first, {**first, **changes}])
-
-
 def with_parameter(value: object) -> str:
-    return edited(parameters=[{"name": "p" * 200, "type": "int", "value": value}])
+    return edited(parameters=[{"name": "p", "type": "integer", "value": value}])
 
 
 LARGEST = 2**63 - 1
@@ -108,65 +105,38 @@ BOUNDS: dict[str, tuple[Callable[[int], str], int, int]] = {
         0,
         LARGEST,
     ),
-    "endpoints[1].matched": (lambda value: second(matched=value), 0, LARGEST),
-    "endpoints[1].size_bytes": (lambda value: second(size_bytes=value), 0, LARGEST),
-    "endpoints[1].dscp": (lambda value: second(dscp=value), 0, 63),
+    "endpoints[0].matched": (lambda value: with_endpoint(matched=value), 0, LARGEST),
+    "endpoints[0].size_bytes": (lambda value: with_endpoint(size_bytes=value), 0, LARGEST),
+    "endpoints[0].dscp": (lambda value: with_endpoint(dscp=value), 0, 63),
     **{
-        f"endpoints[1].qos.{field}": (
-            lambda value, field=field: second(qos={field: value}),
+        f"endpoints[0].qos.{field}": (
+            lambda value, field=field: with_endpoint(qos={field: value}),
             0,
             LARGEST,
         )
         for field in ("depth", "deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns")
     },
     **{
-        f"endpoints[1].nfes.{field}": (
-            lambda value, field=field: second(nfes=[{**NFE, field: value}]),
+        f"endpoints[0].nfes[0].{field}": (
+            lambda value, field=field: with_endpoint(nfes=[{**NFE, field: value}]),
             0,
             most,
         )
         for field, most in (("transport_port", 65535), ("flow_label", 0xFFFFF), ("dscp", 63))
     },
-    "parameters." + "p" * 100: (with_parameter, -LARGEST - 1, LARGEST),
+    "parameters[0].value": (with_parameter, -LARGEST - 1, LARGEST),
 }
 
 
 @pytest.mark.parametrize("what", BOUNDS)
-def test_of_every_number_what_it_can_be_is_read_and_all_else_refused_with_what_is_allowed(
-    what: str,
-) -> None:
+def test_of_every_number_what_it_can_be_is_read_and_all_else_refused(what: str) -> None:
     write, least, most = BOUNDS[what]
     for value in (least, most):
         assert decode_configuration(write(value), NAME).name == NAME
     for value in (least - 1, most + 1):
         with pytest.raises(ConfigurationError) as caught:
             decode_configuration(write(value), NAME)
-        assert str(caught.value) == f"{what} is '{value}'; allowed: {least}–{most}"
-
-
-def test_what_is_refused_is_quoted_no_longer_than_a_line() -> None:
-    for text, message in (
-        (
-            second(gid="zz" * 100),
-            f"endpoints[1].gid is '{'z' * 100}'; allowed: 32 hex digits",
-        ),
-        (
-            second(nfes=[{**NFE, "internet_address": "y" * 200}]),
-            f"endpoints[1].nfes.internet_address is '{'y' * 100}'; allowed: an IP address",
-        ),
-        (
-            edited(connections=[{"name": "a", "prefix": "ab" * 12}, {"name": "b", "prefix": "a"}]),
-            "connections[1].prefix is 'a'; allowed: 24 hex digits, or none",
-        ),
-        (
-            edited(parameters=[{"name": "p", "type": "integer_array", "value": [1, 2**63]}]),
-            f"parameters.p is '{2**63}'; allowed: {-LARGEST - 1}–{LARGEST}",
-        ),
-        (edited(name="x" * 200), f"it is that of node '{'x' * 100}'"),
-    ):
-        with pytest.raises(ConfigurationError) as caught:
-            decode_configuration(text, NAME)
-        assert str(caught.value) == message
+        assert str(caught.value).endswith(f"at `$.{what}`"), caught.value
 
 
 def test_deep_text_is_refused_in_a_thread_with_little_stack_too() -> None:

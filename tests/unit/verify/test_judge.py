@@ -13,7 +13,7 @@ from lifecycle.manifest.model import (
     Policy,
     RosInterfaceAccess,
 )
-from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import with_findings, without_findings
 from lifecycle.verify.outcome import Outcome
@@ -121,7 +121,6 @@ def test_tools_are_listed_with_what_they_have_and_the_pattern_that_tolerates_the
 
 
 ARRAY, TRIGGER = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
-SYSTEM_DEFAULT = Liveliness.SYSTEM_DEFAULT
 ONE_PARTICIPANT = "10000000000000000000000a"
 
 
@@ -175,73 +174,40 @@ def of_two_machines(**policy: object) -> Plan:
     )
 
 
-def asserts(number: int, end: str = "", type: str = STRING, name: str = "", gid: str = "") -> Edit:  # noqa: A002
-    """The liveliness of the supervisor of machine `far`, of the participant of `supervisor`."""
-    name = name or f"/_lifecycle_observer_{number}"
-    gid = gid or f"{ONE_PARTICIPANT[:-1]}{number}7"
-    topic = f"/_lifecycle/robot/far/alive{end}"
-    return add_endpoint(PUB, name, topic, gid=gid, type=type, qos=QosProfile())
-
-
-def serves(number: int, service: str = "get_status", machine: str = "far") -> Edit:
+def serves(number: int, service: str = "get_status", gid: str = "") -> Edit:
     name = f"/_lifecycle_observer_{number}"
-    return add_endpoint(SERVER, name, f"/lifecycle/robot/{machine}/{service}", type=TRIGGER)
+    return both(
+        add_node(name),
+        add_endpoint(SERVER, name, f"/lifecycle/robot/far/{service}", type=TRIGGER, gid=gid),
+    )
 
 
-@pytest.mark.parametrize(("end", "type_"), [("", STRING), ("_pulse", "std_msgs/msg/Empty")])
-def test_a_supervisor_of_another_machine_is_known_by_its_liveliness_before_its_status_is_seen(
-    end: str, type_: str
-) -> None:
+def test_a_supervisor_of_another_machine_is_known_by_whatever_is_seen_of_it_first() -> None:
     """After an outage its services may be seen before its status topic, or the other way round."""
-    plan, observer = of_two_machines(), add_node("/_lifecycle_observer_1")
-    alive = asserts(1, end, type_)
-    server = "graph.undeclared-service-server", "/_lifecycle_observer_1"
-    assert rules(plan, observer, serves(1)) == [(*server, "/lifecycle/robot/far/get_status")]
-    assert rules(plan, observer, serves(1), alive) == []
-    # It is that of its machine, and may do what the policy allows.
-    near = serves(1, machine="near")
-    assert rules(plan, observer, near, alive) == [(*server, "/lifecycle/robot/near/get_status")]
+    plan = of_two_machines()
+    status, *_ = rules(of_two_machines(ros_interface=RosInterfaceAccess.OFF), serves(1))
+    assert status[2] == "/lifecycle/robot/far/get_status"
+    assert rules(plan, serves(1)) == []
+    assert judged(plan, serves(1)).tolerated == ()
     pauses = serves(1, "pause")
-    assert rules(plan, observer, pauses, alive) == [(*server, "/lifecycle/robot/far/pause")]
-    full = of_two_machines(ros_interface=RosInterfaceAccess.FULL)
-    assert rules(full, observer, pauses, alive) == []
-    off = of_two_machines(ros_interface=RosInterfaceAccess.OFF)
-    assert rules(off, observer, serves(1), alive) == [(*server, "/lifecycle/robot/far/get_status")]
-    assert judged(plan, observer, serves(1), alive).tolerated == ()
+    assert [each[2] for each in rules(plan, pauses)] == ["/lifecycle/robot/far/pause"]
+    assert rules(of_two_machines(ros_interface=RosInterfaceAccess.FULL), pauses) == []
 
 
 def test_who_only_is_called_as_the_supervisor_of_a_machine_is_not_taken_for_it() -> None:
     plan = of_two_machines()
-    both_are = both(add_node("/_lifecycle_observer_1"), add_node("/_lifecycle_observer_2"))
-    # Two participants assert to be it: of one node's name, or of two.
-    for other in (asserts(2), asserts(2, name="/_lifecycle_observer_1"), asserts(1, gid="7" * 25)):
-        found = rules(plan, both_are, serves(1), asserts(1), other)
-        assert found == [
-            (
-                "graph.undeclared-service-server",
-                "/_lifecycle_observer_1",
-                "/lifecycle/robot/far/get_status",
-            )
-        ]
-    # One asserts it and another has its status: neither is believed.
-    both_say = rules(
-        plan, supervisor(1, "robot/far"), add_node("/_lifecycle_observer_2"), asserts(2)
-    )
-    assert {each[2] for each in both_say} == {
-        "/lifecycle/robot/far/status",
-        "/lifecycle/robot/far/get_status",
-    }
-    # Its own status and its own liveliness agree, and so do two status topics of one participant.
+    offered = ["/lifecycle/robot/far/get_status", "/lifecycle/robot/far/status"]
+    # Two say that they are it: of two nodes' names, or two participants of one.
+    for other in (serves(2), serves(1, gid="7" * 25)):
+        both_say = rules(plan, supervisor(1, "robot/far"), other)
+        assert sorted({each[2] for each in both_say}) == offered
+    # Two status topics of one participant agree.
     again = add_endpoint(
         *(PUB, "/_lifecycle_observer_1", "/lifecycle/robot/far/status"),
         gid=f"{ONE_PARTICIPANT[:-1]}19",
         qos=QosProfile(),
     )
-    assert rules(plan, supervisor(1, "robot/far"), asserts(1), again) == []
-    # No liveliness of another type or of a tool's counts.
-    for other in (asserts(1, type=TRIGGER), asserts(1, name="/rqt_1")):
-        tools = both(both_are, add_node("/rqt_1"))
-        assert rules(plan, tools, serves(1), other)[0][2] == "/lifecycle/robot/far/get_status"
+    assert rules(plan, supervisor(1, "robot/far"), again) == []
 
 
 def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> None:
@@ -272,15 +238,8 @@ def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> 
     ("end", "publishes"),
     [
         (subscription("/diagnostics", ARRAY), True),
-        (subscription("/diagnostics", ARRAY, qos=QosProfile(liveliness=SYSTEM_DEFAULT)), True),
         (publisher("/diagnostics", ARRAY), True),
         (subscription("/diagnostics", "my_msgs/msg/Diagnostics"), False),
-        (
-            subscription(
-                "/diagnostics", ARRAY, qos=QosProfile(durability=Durability.TRANSIENT_LOCAL)
-            ),
-            False,
-        ),
     ],
 )
 def test_a_supervisor_does_not_publish_diagnostics_where_it_would_disturb(

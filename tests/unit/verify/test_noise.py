@@ -12,10 +12,8 @@ from lifecycle.verify.tool_filter import (
     action_part,
     fold_actions,
     is_noise_endpoint,
-    is_noise_node,
     our_nodes,
     tolerating_pattern,
-    without_noise,
 )
 from tests.builders import endpoint, node, planned, publisher, subscription
 
@@ -55,14 +53,14 @@ def parts(node: str = "/base", action: str = "/dock") -> list[ObservedEndpoint]:
     ],
 )
 def test_a_tool_is_noise(name: str):
-    assert is_noise_node(name)
+    assert tolerating_pattern(name)
 
 
 @pytest.mark.parametrize(
     "name", ["/camera", "/rviz_less/camera", "/robot/rqtish", "/launch", "/_camera_flow_0"]
 )
 def test_a_node_of_a_system_is_not_noise(name: str):
-    assert not is_noise_node(name)
+    assert not tolerating_pattern(name)
 
 
 STRING = "std_msgs/msg/String"
@@ -148,16 +146,6 @@ def test_a_node_is_ours_by_two_services_that_nobody_else_has_together():
     assert our_nodes([ours[0], server("/b/map_to", SET_PARAMETERS, "/a")]) == frozenset()
 
 
-def test_what_users_call_like_the_node_interface_is_left_in():
-    libraries = [server("/a/get_parameters", GET_PARAMETERS)]
-    own = [server("/a/disconnect", SET_PARAMETERS), server("/a/get_configuration", TRIGGER)]
-    assert without_noise([*libraries, *own]) == tuple(own)
-    ours = [*own, server("/a/map_to", SET_PARAMETERS)]
-    assert without_noise([*libraries, *ours]) == ()
-    assert without_noise([*libraries, *own], ours={"/a"}) == ()
-    assert without_noise([*libraries, *ours], ours=()) == tuple(ours)
-
-
 @pytest.mark.parametrize(
     ("kind", "name", "expected"),
     [
@@ -214,14 +202,12 @@ def test_parts_of_two_nodes_do_not_make_one_action():
     assert sorted(fold_actions(mixed), key=str) == sorted(mixed, key=str)
 
 
-def test_parts_of_another_type_stay_beside_their_action():
+def test_parts_of_another_type_make_no_action_and_stay_beside_one() -> None:
     some = parts()
     wrong = [replace(each, type="std_msgs/msg/String") for each in some[-2:]]
-    action, *left = fold_actions([*some[:-2], *wrong])
+    assert fold_actions([*some[:-2], *wrong]) == (*some[:-2], *wrong)
+    action, *left = fold_actions([*some, *wrong])
     assert (action.type, left) == ("robot/action/Dock", wrong)
-    none_right = [replace(each, type="std_msgs/msg/String") for each in some]
-    action, *left = fold_actions(none_right)
-    assert (action.type, left) == ("", none_right)
 
 
 def test_parts_of_an_action_client_that_is_there_already_are_no_second_one():
@@ -304,9 +290,11 @@ def test_what_feeds_the_system_is_left_in_although_it_looks_like_a_client_librar
             kind=PUB, node=node, name=f"{node}/transition_event", type=TRANSITION
         )
 
-    found = [event("/one"), event("/three"), server("/one/get_parameters", GET_PARAMETERS, "/one")]
-    assert without_noise(found) == ()
-    assert without_noise(found, but=names_declared()) == (found[0], found[2])
+    own, other = event("/one"), event("/three")
+    asked = server("/one/get_parameters", GET_PARAMETERS, "/one")
+    names = names_declared()
+    assert not any(names.keeps(each, each.node, ours=False) for each in (own, other, asked))
+    assert names.keeps(replace(own, node="/rviz2"), "/rviz2", ours=False)
 
 
 @pytest.mark.parametrize(

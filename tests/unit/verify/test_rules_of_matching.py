@@ -21,6 +21,7 @@ from tests.unit.verify.edits import (
     change_endpoint,
     change_report,
     drop_endpoint,
+    unchanged,
 )
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
@@ -37,10 +38,6 @@ def pair(qos: QosProfile = QosProfile(), *, linked: bool = False) -> Plan:  # no
         links=[link("/a", "one", "two")] if linked else [],
         policy=OPEN,
     )
-
-
-def unchanged(seen: Observation) -> Observation:
-    return seen
 
 
 def matching(edit: Edit, plan: Plan) -> list[Finding]:

@@ -27,7 +27,7 @@ from tests.unit.verify.edits import (
     change_announced_qos,
     change_endpoint,
 )
-from tests.unit.verify.lines import lines, verify
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -212,36 +212,6 @@ def incompatible(edit: Edit, plan: Plan) -> list[tuple[str, str, str]]:
 
 
 LESS = change_announced_qos(PUB, "/a", reliability=Reliability.BEST_EFFORT)
-
-
-SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
-    "a policy differs": (
-        change_announced_qos(PUB, "/a", deadline_ns=NS),
-        pair(QosProfile()),
-        ["violated graph.qos-differs: /a, /one (publisher) at 11:9"],
-    ),
-    "nobody announces a policy": (
-        change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0),
-        pair(QosProfile()),
-        ["unverifiable graph.qos-unverifiable: /one, /one at 11:9"],
-    ),
-    "a pair is incompatible": (
-        LESS,
-        pair(QosProfile(), QosProfile()),
-        ["violated graph.qos-incompatible: /a: /one → /two, no node at 11:9"],
-    ),
-    "a pair may be incompatible": (
-        change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN),
-        pair(QosProfile(), QosProfile()),
-        ["unverifiable graph.qos-incompatible: /a: /one → /two, no node at 11:9"],
-    ),
-}
-
-
-@pytest.mark.parametrize("case", SAYS)
-def test_what_is_found_of_qos_where(case: str):
-    edit, plan, text = SAYS[case]
-    assert lines(of(text[0].split()[1][:-1], edit, plan)) == text
 
 
 def open_world(*endpoints: object) -> Plan:

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ExpectedParameter, Plan
-from lifecycle.verify.observation import Observation, ParameterReport
+from lifecycle.verify.observation import ParameterReport
 from lifecycle.verify.tool_filter import CLOCK, DeclaredNames
 from lifecycle.verify.verdict import Stage
 from tests.builders import at, endpoint, node, planned, publisher
@@ -18,6 +18,7 @@ from tests.unit.verify.edits import (
     both,
     change_configuration,
     change_endpoint,
+    unchanged,
 )
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
@@ -40,10 +41,6 @@ WITH_SIMULATOR = planned(
 
 def plays(name: str = "/rosbag2_player", **fields: object) -> Edit:
     return both(add_node(name), add_endpoint(PUB, name, CLOCK[0], type=CLOCK[1], **fields))
-
-
-def unchanged(seen: Observation) -> Observation:
-    return seen
 
 
 @pytest.mark.parametrize(

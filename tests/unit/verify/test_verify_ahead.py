@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from msgspec.structs import replace
-
+from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
 from tests.builders import node, planned, publisher, subscription
+from tests.unit.verify.edits import both, change_configuration, change_node
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PLAN = planned(node("one", publisher("a")), node("two", subscription("a")))
 
 
-def _with_active(name: str, state: str = "active", stage: Stage = Stage.CONNECTED):
-    seen = perfect(PLAN, stage)
-    return replace(
-        seen,
-        nodes=tuple(
-            replace(each, state=state) if each.full_name == name else each for each in seen.nodes
-        ),
-        configurations=tuple(
-            replace(each, state=state) if each.name == name else each
-            for each in seen.configurations
-        ),
-    )
+def _with_active(name: str, state: str = "active") -> Observation:
+    edit = both(change_node(name, state=state), change_configuration(name, state=state))
+    return edit(perfect(PLAN))
 
 
 def test_a_node_that_an_earlier_gate_let_through_may_be_active_and_no_other() -> None:

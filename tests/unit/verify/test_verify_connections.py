@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import msgspec
 import pytest
 from msgspec.structs import replace
@@ -22,7 +20,6 @@ from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, 
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
-from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Finding, OpenEndpoint, Stage
 from tests.builders import at, link, nfe, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
@@ -34,6 +31,7 @@ from tests.unit.verify.edits import (
     drop_endpoint,
     drop_node,
     drop_report,
+    unchanged,
 )
 from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
@@ -86,18 +84,9 @@ def plan_of(*, medium: str = "", linked: bool = False, run: Run | None = None) -
 PLAN = plan_of()
 
 
-def unchanged(seen):
-    return seen
-
-
 def findings(edit: Edit, plan: Plan = PLAN, **how: object) -> list[tuple[str, str, str]]:
     verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED, **how)
     return [(each.rule, each.outcome.value, each.subject) for each in verdict.findings]
-
-
-def message(edit: Edit, plan: Plan = PLAN) -> str:
-    (finding,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
-    return finding.message
 
 
 def reported(*urls: str, name: str = "net", error: str = "") -> Edit:
@@ -427,12 +416,6 @@ def test_a_medium_that_nobody_tells_is_unverifiable() -> None:
     assert ("flow.wrong-medium", "unverifiable", FLOW) in findings(unknown, plan_of(medium="udpv4"))
 
 
-def test_the_message_says_both_media() -> None:
-    assert message(WITH_UDP, plan_of(medium="shm")) == (
-        "what carries /camera → /viewer on /video must be shared memory, and is udpv4"
-    )
-
-
 def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
     plan = planned(node("camera", publisher("video")), node("viewer", subscription("video")))
     expected = replace(plan, flows=tuple(replace(each, medium="udpv4") for each in plan.flows))
@@ -450,13 +433,6 @@ def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:
     assert verdict.open_endpoints == (
         OpenEndpoint(kind=PUB, node="/camera", name="/news", type="std_msgs/msg/String"),
     )
-    assert json.loads(to_json(verdict))["open_endpoints"] == [
-        {"kind": "publishers", "node": "/camera", "name": "/news", "type": "std_msgs/msg/String"}
-    ]
-    assert (
-        "endpoints that `endpoints: open` allows\n"
-        "  publisher of /news in /camera, std_msgs/msg/String\n"
-    ) in render_text(verdict)
     closed = verify(
         PLAN, add_endpoint(PUB, "/camera", "/news")(perfect(PLAN)), stage=Stage.CONNECTED
     )

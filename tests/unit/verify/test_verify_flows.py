@@ -31,6 +31,7 @@ from tests.unit.verify.edits import (
     drop_endpoint,
     drop_endpoint_report,
     drop_report,
+    unchanged,
 )
 from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
@@ -42,10 +43,6 @@ PLAN = build_plan(teleop(), environment={})
 
 def flows_after(edit: Edit, plan: Plan = PLAN) -> tuple[FlowReport, ...]:
     return verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
-
-
-def unchanged(seen):
-    return seen
 
 
 def test_every_planned_flow_is_reported_with_both_ends_and_its_requirement():

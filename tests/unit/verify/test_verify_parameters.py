@@ -16,7 +16,6 @@ from lifecycle.verify.observation import (
     ParameterReport,
 )
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.parameters import spell
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, node, planned
@@ -112,6 +111,21 @@ CASES: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = 
         ["param.read-only-differs"],
     ),
     "read_only, which nobody forbids": (expected(), has(1.5, read_only=True), []),
+    "what the command gives is not there": (
+        expected((1, 2), "int_array", source="command"),
+        ABSENT,
+        ["param.missing"],
+    ),
+    "another type, too long to show": (
+        expected(2.0),
+        has("x" * LONGEST_VALUE, "string"),
+        ["param.type-differs"],
+    ),
+    "an array of another type": (
+        expected(None, "string"),
+        has((True, False), "bool_array"),
+        ["param.type-differs"],
+    ),
     "two things wrong at once": (
         expected(read_only=True),
         has(3.0),
@@ -151,12 +165,6 @@ def test_a_warning_of_check_is_a_finding_unless_the_graph_settles_it():
     assert {(each.outcome, each.at) for each in found} == {(Outcome.UNVERIFIABLE, "p.yaml:2:3")}
 
 
-def test_every_rule_of_parameters_has_a_case_in_which_it_fires():
-    fired = {rule for _, _, rules in CASES.values() for rule in rules} | {"param.unverifiable"}
-    fired |= {"param.undeclared", "param.reached-none"}  # test_nodl_conform.py, above
-    assert fired == {each.id for each in RULES if each.id.startswith("param.")}
-
-
 def test_a_finding_names_both_values_and_where_the_demand_comes_from():
     plan = plan_of(
         expected(),
@@ -180,77 +188,6 @@ def test_a_finding_names_both_values_and_where_the_demand_comes_from():
         "parameter unset of node /arm is .inf, and must be .nan as given in "
         "cfg/arm.yaml"
     )
-
-
-SAYS: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = {
-    "a value that is given is not there": (
-        expected((1, 2), "int_array"),
-        ABSENT,
-        ["violated param.missing: /arm: gain, /arm at 60:7"],
-    ),
-    "no number is given, and nothing is there": (
-        expected(".nan"),
-        ABSENT,
-        ["violated param.missing: /arm: gain, /arm at 60:7"],
-    ),
-    "a type that is declared is not there": (
-        expected(None),
-        ABSENT,
-        ["violated param.missing: /arm: gain, /arm at 60:7"],
-    ),
-    "a value that the command gives is not there": (
-        expected(source="command"),
-        ABSENT,
-        ["violated param.missing: /arm: gain, /arm at 60:7"],
-    ),
-    "another type": (
-        expected(2.0),
-        has(2, "int"),
-        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "another type, too long to show": (
-        expected(2.0),
-        has("x" * LONGEST_VALUE, "string"),
-        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "an array of another type": (
-        expected(None, "string"),
-        has((True, False), "bool_array"),
-        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "not set, of any type": (
-        expected(None),
-        has(None, ""),
-        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "not set, of the type": (
-        expected(),
-        has(None),
-        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "another value than the default": (
-        expected(source="default_value"),
-        has(2.0),
-        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "another value than is given, too long to show": (
-        expected(LONG, "double_array", source="cfg/arm.yaml"),
-        has((*LONG[:-1], 0.0), "double_array"),
-        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
-    ),
-    "read_only, and can be set": (
-        expected(read_only=True),
-        has(1.5),
-        ["violated param.read-only-differs: /arm: gain, /arm at 60:7"],
-    ),
-}
-
-
-@pytest.mark.parametrize("case", SAYS)
-def test_what_is_found_of_a_parameter_that_is(case: str):
-    wanted, actual, text = SAYS[case]
-    plan = plan_of(wanted)
-    assert lines(judged(plan, served(plan, *(() if actual is None else (actual,))))) == text
 
 
 @pytest.mark.parametrize(
@@ -279,12 +216,6 @@ def test_a_node_that_nobody_asked_is_unverifiable_and_one_that_is_not_there_is_o
     assert [each.rule for each in judged(plan, seen)] == ["param.unverifiable"]
     gone = replace(seen, nodes=())
     assert [each.rule for each in judged(plan, gone)] == ["graph.missing-node"]
-
-
-def test_a_file_that_could_not_be_read_is_unverifiable():
-    plan = plan_of(unread_parameter_files=("arm.yaml",))
-    (finding,) = judged(plan, perfect(plan, Stage.ACTIVE))
-    assert (finding.rule, finding.subject) == ("param.unverifiable", "/arm: arm.yaml")
 
 
 def reporting(plan: Plan, parameters: tuple[ParameterReport, ...] | None) -> Observation:
