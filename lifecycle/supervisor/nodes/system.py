@@ -132,11 +132,6 @@ class NodeRun:
             what += next((each.unhealthy_reason for each in others if each.unhealthy_reason), "")
         return f"asked to {self.wiring}" if self.wiring else what
 
-    @property
-    def is_up(self) -> bool:
-        """Whether it was brought as far as its gate."""
-        return self.core.level >= self.core.gate
-
     def run_delays_s(self) -> tuple[float, float]:
         """Return the run delays of ours and of its process: ready to run, but without CPU."""
         child = None if self.process is None else self.process.child
