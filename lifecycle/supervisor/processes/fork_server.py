@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import PROCESS_VARIABLE, groups_of
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
@@ -25,7 +24,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ChildReport,
     ForkRequest,
 )
-from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
+from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
     end,
@@ -125,8 +124,6 @@ class ForkServer:
         self._foreign = Lineage().children(os.getpid())
         self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
-        self._closed = False
-        self._gone = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
         process.socket.setblocking(False)
         self._loop.add_reader(process.socket, self._reports)
@@ -294,9 +291,6 @@ class ForkServer:
         self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         status = self._process.popen.wait()
-        self._gone.set()
-        if self._closed:
-            return
         self._reports()
         exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
@@ -305,14 +299,13 @@ class ForkServer:
                 born.set_exception(BringUpError(self.died.result()))
         self._pending.clear()
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """End the fork server; its children must have ended."""
-        self._closed = True
         self._loop.remove_reader(self._process.socket)
-        self._process.socket.close()
-        if not await set_within(self._gone, CLOSE_S):
-            self._process.popen.kill()
-            await self._gone.wait()
+        if not self.died.done():
+            self._loop.remove_reader(self._pidfd)
+            os.close(self._pidfd)
+        self._process.close()
 
 
 async def _until_none(left: Callable[[], Collection[int]]) -> tuple[int, ...]:

@@ -70,15 +70,11 @@ class ForkServerProcess:
             with contextlib.suppress(OSError):
                 self.socket.send("\n".join(types).encode())  # requests to fork are JSON
 
-    def close(self, grace_s: float = CLOSE_S) -> None:
-        """End it; it ends by itself when its socket closes and no child is left. May be repeated.
-
-        Args:
-            grace_s: seconds before it is killed.
-        """
+    def close(self) -> None:
+        """End it: by itself it ends once its socket closes and no child is left. Again is harmless."""
         self.socket.close()
         try:
-            self.popen.wait(grace_s)
+            self.popen.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()

@@ -376,9 +376,6 @@ class FakeForkServer:
     async def end_strays(self) -> tuple[int, ...]:
         return ()
 
-    async def close(self) -> None:
-        """Nothing to close."""
-
 
 def run_started(*nodes: str, **changes: Any) -> RunStarted:
     """How the run of these nodes, a process each, begins."""
