@@ -71,7 +71,7 @@ class ForkServerProcess:
                 self.socket.send("\n".join(types).encode())  # requests to fork are JSON
 
     def close(self) -> None:
-        """End it: by itself it ends once its socket closes and no child is left. Again is harmless."""
+        """End it: it ends once its socket is closed and no child is left. Again is harmless."""
         self.socket.close()
         try:
             self.popen.wait(CLOSE_S)
