@@ -218,7 +218,7 @@ def attacks(rng: random.Random) -> list[Attack]:
         *("no nodes", "a node that is none", "levels of nobody", "flows of nobody"),
         *("domain 9999", "names of a terminal", "twice the same"),
     ):
-        add(f"differences, {change}", _other_plan, change, "differences")
+        add(f"status, {change}", _other_plan, change, "status")
         add(f"apply, {change}", _other_plan, change, "apply")
     for node in ("nobody", "", "\x1b[2J", "/" * 5000, "talker\n"):
         if node:

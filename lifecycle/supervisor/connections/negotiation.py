@@ -2,8 +2,8 @@
 
 Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome reaches
 nodes and the verifier; `party_of`: a node as a party, from its configuration, under what its
-manifest declares; and `Expectation`: the desired state of a negotiated system, for an observer that
-decides nothing. The rules of negotiation are lifecycle.plan's. Pure.
+manifest declares; and `expected_by_onlooker`: the same for an observer that decides nothing. The
+rules of negotiation are lifecycle.plan's. Pure.
 
 What the authority of such a system decided is in no manifest, but negotiation is a pure function:
 the same node configurations always result in the same data layer graph, but for ports and groups
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 
-import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
@@ -158,7 +157,7 @@ class NegotiatedSource:
 
     Args:
         plan: what is declared.
-        before: what was negotiated already; see `Expectation` for an observer.
+        before: what was negotiated already.
 
     Attributes:
         graph: what was negotiated last.
@@ -342,41 +341,17 @@ def is_negotiated(plan: Plan) -> bool:
     return layer.authority is Authority.SUPERVISOR and layer.source is DataLayerSource.DYNAMIC
 
 
-class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Desired state, as far as an outside observer can know it.
+def expected_by_onlooker(plan: Plan, observation: Observation) -> tuple[Plan, tuple[Finding, ...]]:
+    """Return the plan as an outside observer must see it, and declared pairs nothing can connect.
 
-    Attributes:
-        plan: with the connections and the endpoints made in code that must be seen now.
-        findings: pairs of declared nodes that nothing can connect.
+    It negotiates again from what was seen: it begins with all reported connections, and each round
+    leaves out those that no negotiation would have made, as another client called connect_to; an
+    endpoint on one of these stays there, is mapped wrongly, and may make another superfluous. The
+    URLs of one that fits are not judged: only its authority knows which ports it gave out.
     """
-
-    plan: Plan
-    findings: tuple[Finding, ...] = ()
-
-    @classmethod
-    def of(cls, plan: Plan, observation: Observation) -> Expectation:
-        """Negotiate again from what was seen; what is not negotiated is expected as it is planned.
-
-        A connection that no negotiation would have made, because another client called connect_to,
-        is not expected, and what is mapped onto it is mapped wrongly. The URLs of one that fits
-        are not judged: only its authority knows which ports it gave out.
-        """
-        if not is_negotiated(plan):
-            return cls(plan=plan)
-        known = {each.name: each for each in observation.configurations}
-        source = _negotiated_again(plan, known)
-        return cls(
-            plan=source.expected,
-            findings=tuple(not_wired(plan.system, each) for each in source.problems),
-        )
-
-
-def _negotiated_again(plan: Plan, known: Mapping[str, NodeConfiguration]) -> NegotiatedSource:
-    """Find the reported connections that a negotiation would make, and negotiate with them.
-
-    It begins with all of them, and each round leaves out those that none would have made; an
-    endpoint on one of these stays there, which may make another superfluous.
-    """
+    if not is_negotiated(plan):
+        return plan, ()
+    known = {each.name: each for each in observation.configurations}
     before = DataLayerGraph(connections=tuple(_reported(plan, known)))
     while True:
         source = NegotiatedSource(plan, before=before)
@@ -384,8 +359,9 @@ def _negotiated_again(plan: Plan, known: Mapping[str, NodeConfiguration]) -> Neg
         made = {(each.node, each.name) for each in source.graph.connections}
         stays = tuple(each for each in before.connections if (each.node, each.name) in made)
         if stays == before.connections:
-            return source
+            break
         before = DataLayerGraph(connections=stays)
+    return source.expected, tuple(not_wired(plan.system, each) for each in source.problems)
 
 
 def _reported(plan: Plan, known: Mapping[str, NodeConfiguration]) -> Iterator[NegotiatedConnection]:

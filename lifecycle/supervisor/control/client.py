@@ -74,7 +74,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     Returns:
         Nothing where they do not differ, or no answer comes in time: a notice is not worth a wait.
     """
-    question = Question(ask=ControlRequest.DIFFERENCES, plan=plan)
+    question = Question(ask=ControlRequest.STATUS, plan=plan)
     try:
         answer = _asked(path, question, STATUS_S, Answer)
     except TimeoutError:
@@ -132,23 +132,22 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     deadline = time.monotonic() + timeout_s
     patience = time.monotonic() + _STARTS_S
     question, left_s = Question(ask=ControlRequest.DOWN), timeout_s
-    while (answer := _asked(path, question, left_s, Answer)) is None and is_held(path):
-        # It is just starting, and will listen; or ending, and does so no more.
+    answer: Answer | None = None
+    while True:
+        answer = answer or _asked(path, question, left_s, Answer)
+        if answer is not None and answer.exit_code is None:
+            raise strange(path / _SOCKET, "it has no exit code")
+        if not is_held(path):
+            break
+        # It is just starting, and will listen; or ending, and does so no more; or has answered.
         if time.monotonic() > deadline:
             raise TimeoutError
-        if time.monotonic() > patience:
+        if answer is None and time.monotonic() > patience:
             _terminate(path)
             patience = deadline
-        time.sleep(_ASKED_AGAIN_S)
-        left_s = max(_ASKED_AGAIN_S, deadline - time.monotonic())
+        time.sleep(_AGAIN_S)
+        left_s = max(_AGAIN_S, deadline - time.monotonic())
     if answer is not None:
-        if answer.exit_code is None:
-            raise strange(path / _SOCKET, "it has no exit code")
-        # It has answered already, and is about to let go of its directory.
-        while is_held(path):
-            if time.monotonic() > deadline:
-                raise TimeoutError
-            time.sleep(_LOCK_CHECK_S)
         return ExitCode.OK
     from lifecycle.middleware.process.shared_memory import sweep
     from lifecycle.supervisor.connections.networks import remove_programmed
@@ -180,10 +179,8 @@ def _terminate(path: Path) -> None:
             os.close(pidfd)
 
 
-_ASKED_AGAIN_S = 0.1
+_AGAIN_S = 0.02
+"""Neither a lock nor a socket that is yet to be made can be waited for with a deadline."""
 
 _STARTS_S = 2.0
 """A supervisor listens sooner, unless it waits for a network interface or a discovery server."""
-
-_LOCK_CHECK_S = 0.01
-"""A lock cannot be waited for with a deadline; it is released within milliseconds."""

@@ -175,7 +175,6 @@ class ControlRequest(enum.Enum):
     RESTART = "restart"
     MODE = "mode"
     APPLY = "apply"
-    DIFFERENCES = "differences"
 
 
 class Question(msgspec.Struct, frozen=True, kw_only=True):
@@ -183,7 +182,7 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
-        plan: for DIFFERENCES and orders, the Plan of the client's manifest as it is now; None if
+        plan: for STATUS and orders, the Plan of the client's manifest as it is now; None if
             it was given none. What reads it knows its type, see server.py.
         mode: for MODE, the name of the one to enter.
         dry_run: for APPLY, only say what would become of the system.
@@ -227,7 +226,7 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
         exit_code: for DOWN, of the supervisor, sent once nothing of the system runs any more; for
             an order, what came of it.
         error: why an order was not carried out; empty if it was.
-        differences: for DIFFERENCES, how the plan of the question differs from what runs.
+        differences: for STATUS with a plan, how that differs from what runs, one line each.
         change: for APPLY, what it is about.
     """
 

@@ -128,12 +128,11 @@ class ControlServer:
 
     async def _answer(self, question: Order) -> Answer:
         if question.ask is ControlRequest.STATUS:
-            return Answer(status=self._session.status())
+            plan = question.plan
+            differs = () if plan is None else self._session.differences(plan)
+            return Answer(status=self._session.status(), differences=differs)
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())
-        if question.ask is ControlRequest.DIFFERENCES:
-            plan = question.plan
-            return Answer(differences=() if plan is None else self._session.differences(plan))
         return await self._session.order(question)
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

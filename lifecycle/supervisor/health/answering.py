@@ -120,11 +120,17 @@ class Answering:
         """Learn whether a node answers; one that shows no service may do so in a moment."""
         loop, liveliness = asyncio.get_running_loop(), self._system.liveliness
         is_new, shown_s = node not in self._known_s, loop.time() + SHOWN_S
+        managed = node.planned.managed
         for _ in range(TRIES):
             while (answers := await self._answers(node, repeat=is_new)) is None:
                 liveliness.answered(node.name)
-                if not is_new or loop.time() >= shown_s or self._serves_nothing(node):
-                    self._say_that_it_serves_nothing(node)
+                is_sure = not managed and self._clients.serves_parameters(node.name) is False
+                if is_sure or not is_new or loop.time() >= shown_s:
+                    if node.name not in self._said:
+                        self._said.add(node.name)
+                        what = "~/get_state" if managed else "parameters"
+                        text = f"{node.name!r} serves no {what}: whether it hangs is not seen"
+                        self._system.emit(Notice(message=text))
                     break
                 await asyncio.sleep(_LOOK_S)
             if answers is not False:
@@ -133,18 +139,6 @@ class Answering:
         else:
             liveliness.unanswered(node.name, TRIES * ANSWER_S)
         self._known_s[node] = loop.time()
-
-    def _say_that_it_serves_nothing(self, node: NodeRun) -> None:
-        if node.name not in self._said:
-            self._said.add(node.name)
-            what = "~/get_state" if node.planned.managed else "parameters"
-            message = f"{node.name!r} serves no {what}: whether it hangs is not seen"
-            self._system.emit(Notice(message=message))
-
-    def _serves_nothing(self, node: NodeRun) -> bool:
-        """Whether it is certain that a node has nothing that it can be asked by."""
-        serves = self._clients.serves_parameters(node.name)
-        return not node.planned.managed and serves is False
 
     async def _answers(self, node: NodeRun, *, repeat: bool) -> bool | None:
         try:

@@ -93,8 +93,8 @@ class Marks:
         self._loop = asyncio.get_running_loop()
         self._sockets: dict[int, socket.socket] = {}
         self._to: set[_Way] = set()
-        self._from: dict[_Way, float] = {}
-        self._arrived: dict[_Way, tuple[int, float]] = {}
+        # With what DSCP the last one arrived, and when: none, since they are due.
+        self._from: dict[_Way, tuple[int | None, float]] = {}
 
     @property
     def own_ports(self) -> Ports:
@@ -147,9 +147,7 @@ class Marks:
                 if each.dscp and not is_multicast(each.destination_address)
             )
         self._to = to
-        now_s = self._loop.time()
-        self._from = {each: self._from.get(each, now_s) for each in due}
-        self._arrived = {each: last for each, last in self._arrived.items() if each in due}
+        self._from = {each: self._from.get(each, (None, self._loop.time())) for each in due}
 
     def send(self) -> None:
         """Send one datagram each way; what cannot be sent does not arrive, which the other sees."""
@@ -166,9 +164,8 @@ class Marks:
     def arrived(self) -> tuple[ArrivedMark, ...]:
         """Return with what mark those arrive that must: what does not keep it, if several do."""
         found: dict[tuple[str, int], int | None] = {}
-        for way, since_s in self._from.items():
+        for way, (dscp, last_s) in self._from.items():
             key = (way.machine, way.dscp)
-            dscp, last_s = self._arrived.get(way, (None, since_s))
             if self._loop.time() > last_s + OVERDUE_S:
                 found.setdefault(key, None)
             elif dscp is not None and found.get(key) in (None, way.dscp):
@@ -197,4 +194,4 @@ class Marks:
             for machine in self.machines.get(said.run, ()):
                 way = _Way(machine, said.dscp, said.to)
                 if way in self._from:
-                    self._arrived[way] = (dscp, self._loop.time())
+                    self._from[way] = (dscp, self._loop.time())

@@ -82,10 +82,14 @@ class _Peer(msgspec.Struct):
 
     Attributes:
         what: for messages, "the supervisor of machine 'robot'".
-        machine: empty for an attached node.
+        machine: empty for an attached node, which has nothing of what comes after `lost_at_s`.
         nodes: fully qualified names of the nodes that are lost with it.
         watch: None once it is not followed any more.
         lost_at_s: when it was lost; None while it is not.
+        received: when its last notice was sent and received, and how often it had asked by then.
+        clock: compared with ours.
+        answered: our last question that it has answered; None before the first.
+        unknown_since_s: since when it is there, and has not said its plan.
     """
 
     what: str
@@ -94,6 +98,10 @@ class _Peer(msgspec.Struct):
     watch: AliveSubscription | None = None
     alive: bool = False
     lost_at_s: float | None = None
+    received: tuple[int, int, int] | None = None
+    clock: ClockComparison = msgspec.field(default_factory=ClockComparison)
+    answered: int | None = None
+    unknown_since_s: float | None = None
 
 
 class Peers:
@@ -114,10 +122,7 @@ class Peers:
         self._attached: dict[str, _Peer] = {}
         self._announcements: list[AlivePublisher] = []
         self._silent: Mapping[str, str] = {}
-        self._received: dict[str, tuple[int, int, int]] = {}
-        self._clocks: dict[str, ClockComparison] = {}
         self._asks = self._awaited = 0
-        self._answers: dict[str, int] = {}
         self._answered = asyncio.Event()
         self._exchanging: asyncio.TimerHandle | None = None
         self._notices: PlanNotices | None = None
@@ -126,18 +131,17 @@ class Peers:
         self._judged_marks: tuple[ArrivedMark, ...] = ()
         self._said: PlanNotice | None = None
         self._known: list[PlanNotice] = []
-        self._since: dict[str, float] = {}
         self._again: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
         """Begin to watch, and announce ourselves and our plan where another supervisor may be."""
         system, plan = self._system.plan.system, self._system.plan
-        remote: dict[str, list[str]] = {}
-        for each in self._system.remote.values():
-            remote.setdefault(each.machine, []).append(each.full_name)
-        for machine in filter(None, remote):
-            what, topic = _supervisor_of(machine), supervisor_alive_topic(system, machine)
-            self._supervisors.append(self._watch(topic, what, machine, remote[machine]))
+        remote = self._system.remote.values()
+        for machine in filter(None, dict.fromkeys(each.machine for each in remote)):
+            nodes = (each.full_name for each in remote if each.machine == machine)
+            what = f"the supervisor of machine {machine!r}"
+            topic = supervisor_alive_topic(system, machine)
+            self._supervisors.append(self._watch(topic, what, machine, nodes))
         self.renew()
         if remote:
             self._announcements = [
@@ -267,7 +271,8 @@ class Peers:
         self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
 
     def _noticed(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
-        self._compare(peer.machine, notice, sent_ns, received_ns)
+        if peer.machine:
+            self._compare(peer, notice, sent_ns, received_ns)
         silent = notice.silent
         for name in peer.nodes:
             if name in silent:
@@ -296,7 +301,7 @@ class Peers:
 
         notice = AliveNotice(
             silent=self._silent,
-            received=self._received,
+            received={each.machine: each.received for each in self._supervisors if each.received},
             asks=self._asks,
             marks=self._marks.own_ports,
         )
@@ -318,27 +323,24 @@ class Peers:
             self._notify()
             self._exchanging = self._loop.call_later(EXCHANGED_S, self._exchange)
 
-    def _compare(self, machine: str, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
+    def _compare(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
         """It sent a notice, having received ours."""
-        if not machine:
-            return
-        self._marks.ports[machine] = notice.marks
-        *_, answered = self._received.get(machine, (0, 0, 0))
-        self._received[machine] = (sent_ns, received_ns, notice.asks)
-        if notice.asks != answered:
+        self._marks.ports[peer.machine] = notice.marks
+        *_, asked = peer.received or (0, 0, 0)
+        peer.received = (sent_ns, received_ns, notice.asks)
+        if notice.asks != asked:
             self._notify()
-        clock = self._clocks.setdefault(machine, ClockComparison())
         for own in self._own:
             if own in notice.received:
-                t1_ns, t2_ns, self._answers[machine] = notice.received[own]
-                clock.add(t1_ns, t2_ns, sent_ns, received_ns)
+                t1_ns, t2_ns, peer.answered = notice.received[own]
+                peer.clock.add(t1_ns, t2_ns, sent_ns, received_ns)
         if not self._lacks_answers():
             self._answered.set()
 
     def _lacks_answers(self) -> bool:
         """Whether a supervisor that is there has not answered the question that is waited for."""
         return any(
-            each.alive and self._answers.get(each.machine, self._awaited) < self._awaited
+            each.alive and each.answered is not None and each.answered < self._awaited
             for each in self._supervisors
         )
 
@@ -367,7 +369,7 @@ class Peers:
     def clocks(self) -> tuple[tuple[str, ClockOffset], ...]:
         """Return how far the clocks of other machines are ahead, of those that are known."""
         now_ns = time.time_ns()
-        found = ((machine, each.offset(now_ns)) for machine, each in self._clocks.items())
+        found = ((each.machine, each.clock.offset(now_ns)) for each in self._supervisors)
         return tuple((machine, offset) for machine, offset in found if offset is not None)
 
     # Who planned what, and who was shut down
@@ -448,29 +450,26 @@ class Peers:
     def _unknown(self, observation: Observation) -> Iterator[Finding]:
         """Yield a finding for each machine that is there and has not said what it planned."""
         seen = {each.full_name for each in observation.nodes}
-        there = {each.machine for each in self._supervisors if each.alive}
-        nodes: dict[str, set[str]] = {}
-        for each in self._system.remote.values():
-            nodes.setdefault(each.machine, set()).add(each.full_name)
-            if each.run.kind is not RunKind.ATTACH and each.full_name in seen:
-                there.add(each.machine)
+        started = (e for e in self._system.remote.values() if e.run.kind is not RunKind.ATTACH)
+        there = {each.machine for each in started if each.full_name in seen}
+        now_s = self._loop.time()
         waits_s: list[float] = []
-        for machine in filter(None, nodes):
-            if machine not in there or self._says(machine, nodes[machine]):
-                self._since.pop(machine, None)
+        for peer in self._supervisors:
+            if not (peer.alive or peer.machine in there) or self._has_said(peer):
+                peer.unknown_since_s = None
                 continue
-            left_s = self._since.setdefault(machine, self._loop.time()) + ANNOUNCED_S
-            left_s -= self._loop.time()
+            if peer.unknown_since_s is None:
+                peer.unknown_since_s = now_s
+            left_s = peer.unknown_since_s + ANNOUNCED_S - now_s
             if left_s > 0:
                 waits_s.append(left_s)
             assert self._said is not None
-            who = _supervisor_of(machine)
             yield PLAN_UNKNOWN.finding(
                 outcome=Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
-                subject=who,
+                subject=peer.what,
                 expected=f"plan {self._said.checksum}",
                 observed="not announced yet" if left_s > 0 else "not announced",
-                message=f"cannot tell whether {who} planned the same system: it has not said"
+                message=f"cannot tell whether {peer.what} planned the same system: it has not said"
                 + (" so yet" if left_s > 0 else f" what it planned within {ANNOUNCED_S:g} s"),
             )
         if waits_s:
@@ -478,11 +477,11 @@ class Peers:
                 self._again.cancel()
             self._again = self._loop.call_later(min(waits_s), self._system.touch)
 
-    def _says(self, machine: str, names: set[str]) -> bool:
-        """Whether some notice is of a supervisor that runs the machine, or its nodes."""
+    def _has_said(self, peer: _Peer) -> bool:
+        """Whether some notice is of a supervisor that runs its machine, or its nodes."""
         return any(
-            machine in each.machines
-            or (each.system != self._system.plan.system and not names.isdisjoint(each.nodes))
+            peer.machine in each.machines
+            or (each.system != self._system.plan.system and {*peer.nodes} & {*each.nodes})
             for each in self._known
         )
 
@@ -491,10 +490,6 @@ def _forget(peer: _Peer) -> None:
     if peer.watch is not None:
         peer.watch.destroy()
         peer.watch = None
-
-
-def _supervisor_of(machine: str) -> str:
-    return f"the supervisor of machine {machine!r}"
 
 
 def _who(notice: PlanNotice, system: str) -> str:

@@ -44,13 +44,6 @@ if TYPE_CHECKING:
 
 _NOT_ANSWERED = HealthReport(ok=None, message="it has not answered since its state changed")
 
-_REACHES = {
-    Level.STARTED: Reach.STARTED,
-    Level.CONFIGURED: Reach.CONFIGURED,
-    Level.CONNECTED: Reach.CONNECTED,
-    Level.ACTIVE: Reach.ACTIVE,
-}
-
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
 
@@ -116,7 +109,7 @@ class NodeRun:
         """How far it is brought up, as people and clients read it."""
         run, level = self._system.run, self.core.level
         if level is not Level.DOWN:
-            return _REACHES[level]
+            return Reach[level.name]
         process = run.process_of(self.core)
         stays = run.ending is not None or (process is not None and process.stays_down)
         was_up = self._said.reach is not Reach.WAITING
@@ -131,11 +124,6 @@ class NodeRun:
             others = (self._system.nodes[key] for key in keys if key in self._system.nodes)
             what += next((each.unhealthy_reason for each in others if each.unhealthy_reason), "")
         return f"asked to {self.wiring}" if self.wiring else what
-
-    @property
-    def is_up(self) -> bool:
-        """Whether it was brought as far as its gate."""
-        return self.core.level >= self.core.gate
 
     def run_delays_s(self) -> tuple[float, float]:
         """Return the run delays of ours and of its process: ready to run, but without CPU."""

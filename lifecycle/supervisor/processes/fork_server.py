@@ -17,16 +17,14 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import PROCESS_VARIABLE, groups_of
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
-    SERVES,
     ChildReport,
     ForkRequest,
 )
-from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
+from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
     end,
@@ -44,9 +42,6 @@ _LEFT_S = 0.5
 
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
-
-_READY_S = 10.0
-"""A fork server serves after 0.2 s; a loaded machine takes longer."""
 
 _HOST = "lifecycle.node.host.host"
 
@@ -91,13 +86,11 @@ class ForkServerChild:
         if self.exited.done():
             return
         self._loop.remove_reader(self._pidfd)
-        found = None
+        ours = 0
         with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
-            found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
-        if found is not None:
-            is_exit = found.si_code == os.CLD_EXITED
-            kind = {"status" if is_exit else "signal": found.si_status}
-            self.settle(ProcessExit(**kind))
+            ours, status = os.waitpid(self.pid, os.WNOHANG)
+        if ours:
+            self.settle(ProcessExit.from_wait(status))
         elif patience_s > 0:
             self._loop.call_later(patience_s, self._ended, 0.0)
         else:
@@ -131,9 +124,6 @@ class ForkServer:
         self._foreign = Lineage().children(os.getpid())
         self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
-        self._closed = False
-        self._serves = asyncio.Event()
-        self._gone = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
         process.socket.setblocking(False)
         self._loop.add_reader(process.socket, self._reports)
@@ -156,19 +146,6 @@ class ForkServer:
             # What it had adopted, and what it had started, is ours now.
             roots |= lineage.children(os.getpid()) - self._foreign
         return frozenset().union(*map(lineage.of, roots)) - {self.pid}
-
-    async def ready(self) -> None:
-        """Have the fork server answer, bounded.
-
-        Raises:
-            BringUpError: it does not, or has died.
-        """
-        self._serves.clear()
-        self._ask(SERVES.encode())
-        if not await set_within(self._serves, _READY_S):
-            raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
-        if self.died.done():
-            raise BringUpError(self.died.result())
 
     def _ask(self, message: bytes, descriptors: Sequence[int] = ()) -> None:
         """Send a message; raises BringUpError if it has died, or cannot be asked."""
@@ -287,9 +264,7 @@ class ForkServer:
 
     def _take(self, report: ChildReport, descriptors: list[int]) -> None:
         child = self._children.get(report.id)
-        if report.id == 0:
-            self._serves.set()
-        elif report.id in self._pending:
+        if report.id in self._pending:
             self._born(report, descriptors)
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
@@ -316,26 +291,21 @@ class ForkServer:
         self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         status = self._process.popen.wait()
-        self._gone.set()
-        if self._closed:
-            return
         self._reports()
         exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
-        self._serves.set()
         for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))
         self._pending.clear()
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """End the fork server; its children must have ended."""
-        self._closed = True
         self._loop.remove_reader(self._process.socket)
-        self._process.socket.close()
-        if not await set_within(self._gone, CLOSE_S):
-            self._process.popen.kill()
-            await self._gone.wait()
+        if not self.died.done():
+            self._loop.remove_reader(self._pidfd)
+            os.close(self._pidfd)
+        self._process.close()
 
 
 async def _until_none(left: Callable[[], Collection[int]]) -> tuple[int, ...]:

@@ -16,9 +16,6 @@ from collections.abc import Collection
 from lifecycle.errors import BringUpError
 from lifecycle.run_directory import RUN_VARIABLE, new_run_id
 
-PRELOAD = "preload"
-"""Begins a message that names interface types, one a line; requests to fork are JSON."""
-
 CLOSE_S = 1.0
 """A fork server whose children have ended ends within milliseconds of its socket."""
 
@@ -71,17 +68,13 @@ class ForkServerProcess:
         if self._preloads and types:
             # One that has died is noticed by what asks it to fork.
             with contextlib.suppress(OSError):
-                self.socket.send("\n".join((PRELOAD, *types)).encode())
+                self.socket.send("\n".join(types).encode())  # requests to fork are JSON
 
-    def close(self, grace_s: float = CLOSE_S) -> None:
-        """End it; it ends by itself when its socket closes and no child is left. May be repeated.
-
-        Args:
-            grace_s: seconds before it is killed.
-        """
+    def close(self) -> None:
+        """End it: it ends once its socket is closed and no child is left. Again is harmless."""
         self.socket.close()
         try:
-            self.popen.wait(grace_s)
+            self.popen.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()

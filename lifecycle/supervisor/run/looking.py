@@ -31,7 +31,7 @@ from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
-from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
+from lifecycle.supervisor.connections.negotiation import expected_by_onlooker, is_negotiated
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
@@ -247,20 +247,20 @@ def _judged(
         may_be_over: whether a node that may end by itself, and is not there, has ended.
         unanswered: names of nodes that answered no request.
     """
-    expected = Expectation.of(plan, observation)
-    over = {each.full_name: "" for each in expected.plan.nodes if each.may_end and may_be_over}
-    verdict = verify(expected.plan, observation, stage=Stage.ACTIVE, over=over)
+    expected, unconnected = expected_by_onlooker(plan, observation)
+    over = {each.full_name: "" for each in expected.nodes if each.may_end and may_be_over}
+    verdict = verify(expected, observation, stage=Stage.ACTIVE, over=over)
     own = own_machines(plan, "")
     ours = (each for each in plan.processes if each.machine in own)
     found = (
-        *expected.findings,
+        *unconnected,
         *unlimited(ours),
         *(not_answering(name, TRIES * ANSWER_S) for name in unanswered),
     )
     return JudgedSystem(
-        plan=expected.plan,
+        plan=expected,
         observation=observation,
-        verdict=with_findings(verdict, found, expected.plan.policy),
+        verdict=with_findings(verdict, found, expected.policy),
         where=_where(plan, observation, observer_participant.rmw),
         limits=observer_participant.unknown_versions,
     )

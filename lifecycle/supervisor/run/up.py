@@ -209,7 +209,7 @@ def up(
                 return ended_early(reason, error.exit_code, failed)
             finally:
                 await discovery_server.end(system, asyncio.Event())
-                await fork_server.close()
+                fork_server.close()
 
         result = asyncio.run(_leaving_last(run, conclude))
     finally:

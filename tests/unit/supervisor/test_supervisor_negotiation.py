@@ -17,7 +17,7 @@ from lifecycle.manifest.model import (
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
-from lifecycle.supervisor.connections.negotiation import Expectation, NegotiatedSource
+from lifecycle.supervisor.connections.negotiation import NegotiatedSource, expected_by_onlooker
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
 from tests.builders import at, configuration, need, node, planned, publisher, reported, subscription
 from tests.unit.supervisor.fakes import rewired
@@ -173,7 +173,7 @@ def test_an_onlooker_negotiates_the_same_also_after_guests_came_and_went(
     now = wired_by(authority, *now.values(), earlier)
     del now["/earlier"]
     now = wired_by(authority, *now.values(), GUEST)
-    assert Expectation.of(plan, seen(now)) == Expectation(plan=authority.expected)
+    assert expected_by_onlooker(plan, seen(now)) == (authority.expected, ())
 
 
 def test_what_somebody_else_connected_is_not_expected() -> None:
@@ -185,7 +185,7 @@ def test_what_somebody_else_connected_is_not_expected() -> None:
     now["/talker"] = rewired(
         talker, Operation.MAP_TO, connection="mine", endpoint="publishers/chatter"
     )
-    expected = Expectation.of(plan, seen(now)).plan.node("talker")
+    expected = expected_by_onlooker(plan, seen(now))[0].node("talker")
     assert "mine" not in [each.connection for each in expected.participants]
 
 
@@ -195,8 +195,8 @@ def test_an_onlooker_expects_an_endpoint_made_in_code_with_its_flow() -> None:
     heard = replace(LISTENER.endpoints[0], name="news", resolved="/news")
     talker = replace(TALKER, endpoints=(*TALKER.endpoints, news))
     listener = replace(LISTENER, endpoints=(*LISTENER.endpoints, heard))
-    expected = Expectation.of(plan, seen(known(talker, listener)))
-    assert media(expected.plan) == {
+    expected, _ = expected_by_onlooker(plan, seen(known(talker, listener)))
+    assert media(expected) == {
         ("/chatter", "talker", "listener"): "shm",
         ("/news", "talker", "listener"): "shm",
     }
@@ -205,11 +205,11 @@ def test_an_onlooker_expects_an_endpoint_made_in_code_with_its_flow() -> None:
 def test_what_cannot_be_connected_is_a_finding() -> None:
     plan = plan_of(transport=FlowTransport.TCPV4)
     poor = replace(LISTENER, transports=("udpv4", "shm"))
-    (finding,) = Expectation.of(plan, seen(known(TALKER, poor))).findings
+    _, (finding,) = expected_by_onlooker(plan, seen(known(TALKER, poor)))
     assert (finding.rule, finding.subject) == ("run.not-wired", plan.system)
     assert finding.message.startswith("cannot carry '/chatter' from 'talker' to 'listener' by tcp")
 
 
 def test_where_nothing_is_negotiated_the_plan_is_what_must_be() -> None:
     plan: Plan = replace(plan_of(), data_layer=DataLayer(), positions={"data_layer": at(4)})
-    assert Expectation.of(plan, seen(known(TALKER, LISTENER))) == Expectation(plan=plan)
+    assert expected_by_onlooker(plan, seen(known(TALKER, LISTENER))) == (plan, ())

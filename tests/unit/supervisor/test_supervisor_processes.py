@@ -69,7 +69,7 @@ class _Bench:
         for process in self._processes:
             process.signal(signal.SIGKILL)
             await process.release()
-        await self.fork_server.close()
+        self.fork_server.close()
 
     async def start(self, *argv: str, resources: Resources | None = None, **how: Any) -> Any:
         run = Run(kind=RunKind.COMMAND, command=argv, resources=resources)
