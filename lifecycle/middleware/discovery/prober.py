@@ -51,9 +51,7 @@ _INLINE_QOS, _DATA, _KEY = 0x02, 0x04, 0x08  # flags of DATA; 0x01 is little end
 _UDPV4, _UDPV6 = 1, 2  # LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6
 
 _LOCATOR = re.compile(rb"\x32\x00\x18\x00[\x01\x02]\x00\x00\x00(.{4})", re.DOTALL)
-"""PID_METATRAFFIC_UNICAST_LOCATOR over UDP, and its port."""
-_SWAPPED = re.compile(rb"\x00\x32\x00\x18\x00\x00\x00[\x01\x02](.{4})", re.DOTALL)
-"""The same of a big-endian participant."""
+"""PID_METATRAFFIC_UNICAST_LOCATOR over UDP, and its port; this host is little-endian."""
 
 
 def _parameters(*parameters: tuple[int, bytes]) -> bytes:
@@ -188,7 +186,6 @@ class Prober:
             return
         self._answers[prefix.hex()] = source[0]
         self.ports.update(int.from_bytes(each[1], "little") for each in _LOCATOR.finditer(data))
-        self.ports.update(int.from_bytes(each[1], "big") for each in _SWAPPED.finditer(data))
 
     def listeners(self) -> frozenset[OpenSocket]:
         """Return the UDP sockets of other processes on this host that are asked."""
