@@ -45,10 +45,8 @@ _logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-_BURST_S = (0.02, 0.1)
-_BURST_JUDGED_S = (0.005, 0.05)
-"""A burst of changes is over when nothing changed for so long, and is cut off after so long. Who
-judges waits less: bring-up is a race, and a look costs a few milliseconds."""
+_QUIET_S, _BURST_S = 0.005, 0.05
+"""A burst of changes is over when nothing changed for so long, and is cut off after so long."""
 
 FORGET_AFTER_S = 600.0
 """A node that was silent for so long has left."""
@@ -91,8 +89,6 @@ class Observer:
         discovery: what discovery shows.
         clients: of nodes' services; to be used in the loop.
         changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
-        quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
-        burst_s: it is cut off after so long, ≥ quiet_s.
     """
 
     def __init__(
@@ -108,7 +104,6 @@ class Observer:
         self.discovery = discovery
         self.clients = clients
         self._loop = loop
-        self.quiet_s, self.burst_s = _BURST_S if loop.has_thread else _BURST_JUDGED_S
         self._unplanned = unplanned
         self._follows = loop.has_thread
         self._present: frozenset[str] = frozenset()
@@ -165,7 +160,7 @@ class Observer:
                 break
             # To look costs more than the moment in which the rest of a burst comes.
             if await set_within(self._changed, settling_s):
-                await asyncio.sleep(min(self.quiet_s, settling_s))
+                await asyncio.sleep(min(_QUIET_S, settling_s))
         self._show(nodes)
         given = self.state.given
         asked = (planned if only is None else planned.intersection(only)) - given.keys()
@@ -214,11 +209,11 @@ class Observer:
         """
         loop = self._loop.bind()
         await self._changed.wait()
-        end = loop.time() + self.burst_s
+        end = loop.time() + _BURST_S
         while (left_s := end - loop.time()) > 0:
             self._changed.clear()
             # Not at each change: while nodes come there is one for each of their endpoints.
-            await asyncio.sleep(min(self.quiet_s, left_s))
+            await asyncio.sleep(min(_QUIET_S, left_s))
             if not self._changed.is_set():
                 break
         self._changed.clear()

@@ -123,13 +123,7 @@ def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> f
 
 
 def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] | None) -> Reach:
-    """Return whom a participant can ask over one family.
-
-    Args:
-        domain_id: 0–232.
-        family: of its URLs.
-        environment: says who is looked for, and where; None where the URLs do.
-    """
+    """Return whom a participant can ask over one family; None for an environment: its URLs say."""
     kind = family.kind
     here = _addresses_of(kind)
     if environment is None:
@@ -222,17 +216,8 @@ def missing_port(
 ) -> int | None:
     """Return the UDP port of the multicast by which participants find each other, if it is missing.
 
-    Fast DDS shares that port with other participants. If another kind of socket has it, no
-    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
-    says nothing.
-
-    Args:
-        domain_id: of a participant of this process.
-        urls: its own.
-        environment: as for `reach`.
-
-    Returns:
-        None if this process has it, or participants look for each other elsewhere, too.
+    If another kind of socket has it, no participant of this host finds another, and Fast DDS 2.14
+    says nothing. None if this process has it, or participants look for each other elsewhere, too.
     """
     if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
         return None

@@ -6,9 +6,8 @@ other has, no endpoints but those by which participants find each other, and it 
 once it has asked. Must not import rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
-the same host is often lost, and the participant that answered stays quiet for its next 3 s: a gate
-that opens meanwhile has not seen it. The prober joins once our participant does listen, and is
-answered at its own socket, which counts who answers, and at our participant's.
+the same host is often lost, and who answered is quiet for its next 3 s. The prober joins once our
+participant does listen, and is answered at its own socket, which counts, and at our participant's.
 """
 
 from __future__ import annotations

@@ -72,8 +72,6 @@ def is_used(address: str, port: int) -> bool | None:
 
 
 def _is_used(info: bytes) -> bool | None:
-    if len(info) < _BYTES_RECEIVED + 8:
-        return True  # before Linux 4.2 it cannot be known
     (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
     acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
     if acked >= _FIRST_REQUEST:

@@ -140,8 +140,7 @@ def create_subscription(
 
     NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known. The
     others pass the option to the RMW; STRICTLY_REQUIRED then also demands proof, because some RMWs
-    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399. Destroy it
-    as any other, with `node.destroy_subscription`.
+    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399.
 
     Fast DDS 2.14 gives the port (with its socket, two threads and about 170 kB) back only when the
     participant ends, not with the subscription: whatever re-creates unique subscriptions again and

@@ -108,8 +108,8 @@ _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDic
 def has_shared_memory(node: Node) -> bool:
     """Return whether the participant of `node` has a shared memory transport.
 
-    It is seen when this package makes a participant. Of one that was made otherwise it is what the
-    process has: segments of Fast DDS in /dev/shm.
+    Of one that was made otherwise than by this package it is what the process has: segments of Fast
+    DDS in /dev/shm.
     """
     noted = _SHARED_MEMORY_OF.get(node.context)
     return bool(own_segments()) if noted is None else noted
@@ -119,7 +119,6 @@ def has_shared_memory(node: Node) -> bool:
 def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
     """Give the participant of `context` these settings: construct its first node in the block.
 
-    Everything is as before after the block, and later participants get what they always got.
     Participants that other contexts get inside the block have the settings as well.
 
     Args:

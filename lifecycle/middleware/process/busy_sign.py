@@ -1,10 +1,9 @@
 """Hang detection between two processes: a page that one writes when it is busy and the other reads.
 
 Owns: the page of memory that the two processes share, and when the watcher looks at it. The busy
-one writes the time of day into the page, which costs less than a microsecond and no system call.
-The watcher looks once per limit, and when something that it saw may be over its limit: so neither
-the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps it from noticing then. Must not
-import rclpy.
+one writes the time into the page. The watcher looks once per limit, and when something that it saw
+may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps
+it from noticing then. Must not import rclpy.
 
 Time during which the thread could have run and got no processor is not its own: on an overloaded
 machine a callback of milliseconds takes seconds. The kernel counts it for each thread (run_delay of

@@ -201,10 +201,9 @@ class Rcl:
         return int(made)
 
     def _check_layout(self, version: str) -> None:
-        """Compare what the libraries put into our structs with what must be there.
+        """Compare the defaults that the libraries put into our structs with those of rmw and rcl.
 
-        The defaults are those of rmw_qos_profile_default and rcl_get_default_allocator; a field
-        that moved shows as a wrong default before anything is written through it.
+        A field that moved shows as a wrong default before anything is written through it.
         """
         expected = (1, 10, 1, 2, False, bytes(self.default_allocator), 0)
         options = self.call["rcl_subscription_get_default_options"]().options

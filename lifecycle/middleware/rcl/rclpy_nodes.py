@@ -235,9 +235,9 @@ class RclpyStateMachine:
     """The state machine of one node of rclpy.lifecycle, driven by its own methods.
 
     It is guarded from the moment that rclpy has made the node: its class's constructor may ask for
-    transitions, too. Where a supervisor drives the node, the node's own code asks in vain for what
-    the supervisor does: it is SUCCESS where the node is there already, and FAILURE where the gate
-    is closed. By its services, and from its supervisor, the same request is an error.
+    transitions, too. Where a supervisor drives the node, the node's own code gets SUCCESS for what
+    is reached already, and FAILURE where the gate is closed. By its services, and from its
+    supervisor, the same request is an error.
 
     Args:
         node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.

@@ -53,7 +53,6 @@ TIMEOUT_S = 5.0
 _Reply = TypeVar("_Reply")
 
 _REREAD_S = 1.0
-_LEAST_S = 0.001
 _EVENT_DEPTH = 10
 _GOALS = {
     "configure": "inactive",
@@ -116,19 +115,12 @@ class NodeClients:
             timeout_s: for service, callback and reply together.
             before: awaited when the request is about to leave; what it raises keeps it back.
         """
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + timeout_s
         service = f"{node}/change_state"
-        if self._calls.open(service, ChangeState):
-            # The node drops its reply if it does not know this client's reader yet. It learns of
-            # our readers in order: a reply to one made later proves that it knows this one.
-            await self._calls.call(f"{node}/get_state", GetState, timeout_s, fresh=True)
-        left_s = max(deadline - loop.time(), _LEAST_S)
 
         async def ask() -> bool:
             wanted = Transition(label=transition)
             reply = await self._calls.call(
-                service, ChangeState, left_s, repeat=False, before=before, transition=wanted
+                service, ChangeState, timeout_s, repeat=False, before=before, transition=wanted
             )
             return bool(reply.success)
 
@@ -139,10 +131,7 @@ class NodeClients:
                 return None
             return True if state == _GOALS.get(transition) else None
 
-        try:
-            return await _reply(ask(), reached)
-        except ServiceUnansweredError as error:
-            raise ServiceUnansweredError(service, found=error.found, timeout_s=timeout_s) from error
+        return await _reply(ask(), reached)
 
     async def get_configuration(
         self, node: str, *, timeout_s: float = TIMEOUT_S, expected: bool = False
