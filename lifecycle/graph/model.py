@@ -99,16 +99,6 @@ class GraphChange(msgspec.Struct, frozen=True, kw_only=True):
         return view.name
 
     @property
-    def joined(self) -> bool:
-        """The node was not there before."""
-        return self.before is None
-
-    @property
-    def left(self) -> bool:
-        """The node is not there any more."""
-        return self.after is None
-
-    @property
     def status_changed(self) -> bool:
         """It says something else of itself."""
         before, after = (view and view.status for view in (self.before, self.after))
