@@ -79,15 +79,13 @@ class Observer:
 
     Args:
         discovery: what is there.
-        clients: services of nodes.
+        clients: services of nodes; to be used in the loop.
         loop: where everything runs.
         unplanned: `observe` also asks nodes that are not planned, as far as they have our node
             interface.
 
     Attributes:
         state: layer 3.
-        discovery: what discovery shows.
-        clients: of nodes' services; to be used in the loop.
         changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
     """
 
@@ -133,16 +131,13 @@ class Observer:
     ) -> Observation:
         """Return what is there now, as the state has it then.
 
-        Waits until every participant that was there before us is seen, which takes a moment at
-        first: an observation that misses one would prove nothing about undeclared nodes.
-
-        Planned nodes whose configuration was not put into the state are asked for their state and
-        their configuration; what they do not answer within a second stays unknown. Those that
-        report no parameters, and of which some are planned or waited for, are asked for these
-        (parameters.py).
+        Waits until every participant that was there before us is seen: an observation that misses
+        one would prove nothing about undeclared nodes. Planned nodes whose configuration was not
+        put into the state are asked for it and for their state; what they do not answer within a
+        second stays unknown. Parameters that they do not report are read (parameters.py).
 
         Args:
-            plan: see above.
+            plan: whose nodes are asked.
             only: full names of the planned nodes that are asked; None for all.
             machines: whose subscriptions are measured where the plan asks for it; None for all.
 
@@ -233,9 +228,8 @@ class Observer:
     ) -> dict[str, Answer]:
         """Ask wanted nodes, and those that are not planned if those are to be asked.
 
-        What nodes say of themselves that are in no host of ours is left out. On this machine a host
-        shows that it is one. Of another machine's nodes those count that the plan has in a host:
-        its supervisor started them there.
+        What nodes say of themselves that are in no host of ours is left out; on another machine
+        those count that the plan has in a host.
         """
         planned = {each.full_name: bool(each.run.python) for each in plan.nodes}
         asking = [self._ask(node) for node in nodes if node.full_name in wanted]

@@ -72,16 +72,10 @@ class ParameterReadings:
             self._clients.on_parameters(self._arrived)
 
     async def follow(self, nodes: Collection[str], *, reporting: Collection[str]) -> bool:
-        """Read the named parameters of nodes from now on.
+        """Read the named parameters of nodes (full names) from now on; return whether it waited.
 
-        Waits for those that were never read, no longer than a node may take to answer.
-
-        Args:
-            nodes: full names, which have been listened for.
-            reporting: nodes that report their parameters themselves now; they are not read.
-
-        Returns:
-            Whether it has waited, so that what was seen before may be so no more.
+        It waits for those that were never read, no longer than a node may take to answer. Nodes
+        that are `reporting` their parameters themselves now are not read.
         """
         for name in reporting:
             self.forget(name)

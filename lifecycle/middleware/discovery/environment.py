@@ -193,11 +193,6 @@ def all_by_multicast(
     """Return whether all participants of a system can send their endpoints by multicast.
 
     So it is on one host, where no other is looked for by its address: routers pass no multicast.
-
-    Args:
-        machines: those of the system's nodes.
-        own: machines that are this host.
-        environment: where ROS_STATIC_PEERS is looked up.
     """
     return set(machines) <= set(own) and not environment.get(PEERS_VARIABLE)
 
@@ -282,13 +277,8 @@ def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
 def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
     """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
 
-    It looks at the first four participants of each, and only with the range SUBNET. Participants
-    without UDP over IPv4 would look for no others then, so where the user's settings take it
-    away, nothing is added.
-
-    Args:
-        hosts: IPv4 addresses.
-        environment: what it is now.
+    Participants without UDP over IPv4 would look for no others then, so where the user's settings
+    take it away, nothing is added.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
@@ -307,8 +297,7 @@ def discovery_peers(
         environment: where settings of Fast DDS are looked up.
 
     Returns:
-        Address and UDP port, the groups of multicast among them; nothing without hosts, or where
-        the user's own settings say how others are found.
+        Addresses and UDP ports; nothing where the user's own settings say how others are found.
     """
     if not hosts or chosen_otherwise(environment):
         return ()

@@ -311,8 +311,8 @@ class Settling:
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `left_s` wait for who came since; return whether there may be anybody.
 
-        On this host participants have sockets, and who has more of them than the graph shows
-        participants is not seen yet. On others they have to be asked.
+        Where this host has more new sockets than the graph shows new participants, one is not seen
+        yet. On other hosts they have to be asked.
 
         Args:
             everybody: wait also for what those have to say that are known: this process did not

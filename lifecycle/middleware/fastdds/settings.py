@@ -49,15 +49,8 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     An observer needs none, and a process that is killed while it holds the mutex of a port there
-    blocks each process that sends to it for 10 s at a time.
-
-    Args:
-        settings: what it needs otherwise.
-        super_client: it is to be, see ParticipantConnections.
-
-    Returns:
-        `settings`, where they, a profile or the environment say what transports it has, and with
-        another RMW or an unknown version of Fast DDS.
+    blocks each process that sends to it for 10 s at a time. It is chosen where these settings, a
+    profile or the environment say what transports there are, and by another RMW.
     """
     if get_rmw_implementation_identifier() != RMW or fast_dds_refusal():
         return settings

@@ -49,7 +49,7 @@ def run(task: Task) -> None:
 
 
 def described(entity: Any) -> str:
-    """Return what a callback is of, in words; empty where there is nothing to say."""
+    """Return what a callback is of, in words; empty for a task."""
     try:
         if isinstance(entity, Subscription):
             return f"of the subscription of {entity.topic_name}"

@@ -89,9 +89,8 @@ Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 class GraphObserver:
     """What discovery shows of the graph of one domain, to a hidden node of its own.
 
-    Make it before starting what it is to see: a participant that is there already is found at
-    once. `destroy` it, or use it in a `with`. Every method may be called from any thread.
-    `GraphObserver.on` looks through a node that is there already.
+    Make it before starting what it is to see. `destroy` it, or use it in a `with`. Every method may
+    be called from any thread. `GraphObserver.on` looks through a node that is there already.
 
     Args:
         domain_id: 0–232.
@@ -150,8 +149,7 @@ class GraphObserver:
     def on(cls, node: Node) -> GraphObserver:
         """Look through a node that others spin, and destroy after this.
 
-        How its participant is connected is not known here, so that no participant can be asked to
-        announce itself: for the first 3.5 s a snapshot may miss some (`settling`).
+        Nobody can be asked here: for the first 3.5 s a snapshot may miss some (`settling`).
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.

@@ -111,7 +111,7 @@ class GraphGuard:
                 self.notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
-        watch = _Guarded(node) if abi.is_known() else _Comparison(node)
+        watch = _Comparison(node) if abi.refusal() else _Guarded(node)
         self._watch, self.failure = watch, None
         watch.thread = threading.Thread(
             target=self._run, args=[watch], name="graph-guard", daemon=True

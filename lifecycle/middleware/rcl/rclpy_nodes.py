@@ -53,13 +53,7 @@ class NodeHooks(Protocol):
         """Wrap rclpy's constructor; yields the name and keywords to construct with."""
 
     def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
-        """Make an endpoint that a factory was asked for; None has rclpy make it.
-
-        Args:
-            node: whose it is to be.
-            kind: publisher or subscription.
-            arguments: of the factory, by name.
-        """
+        """Make a publisher or subscription that a factory was asked for; None has rclpy make it."""
 
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """One of a node's factories, or an action's constructor, is about to return."""

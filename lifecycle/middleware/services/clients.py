@@ -342,10 +342,9 @@ class NodeClients:
         Args:
             node: that is wired.
             operation: "connect_to" makes a connection, "map_to" carries an endpoint by one,
-                "disconnect" removes one, "remap" gives an endpoint another name.
+                "disconnect" removes one.
             name: of the connection, or of the endpoint, `publishers/video`.
-            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own;
-                new name of remap.
+            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own.
             timeout_s: for the answer.
         """
         is_text = isinstance(value, str)

@@ -39,7 +39,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.process.busy_sign import BusySign, label
+from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.stacks import show_stacks_here
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.executor import NodeExecutor, described, run
@@ -74,7 +74,7 @@ class Watchdog:
         """Note that a callback begins, and of what it is; None for a task."""
         self._running = True
         if not self._changing:
-            self._sign.begin(what=label("" if entity is None else described(entity)))
+            self._sign.begin(what=described(entity))
 
     def end(self) -> None:
         """Note that it has ended."""
