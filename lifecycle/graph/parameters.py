@@ -61,11 +61,7 @@ class ParameterReadings:
         self._named: dict[str, Names] = {}
 
     def listen(self, named: Mapping[str, Names]) -> None:
-        """Take each change of a named parameter as a reason to look again.
-
-        Args:
-            named: by full node name; without any, nothing is subscribed to.
-        """
+        """Take each change of a parameter that is named, by node, as a reason to look again."""
         # Looks at a part of the system go on beside those at all of it.
         self._named.update(named)
         if named:
@@ -110,12 +106,9 @@ class ParameterReadings:
             self.forget(name)
 
     def reread(self, node: str | None = None) -> bool:
-        """Have the next `follow` wait for readings that begin now; None for all nodes.
+        """Have the next `follow` wait for readings that begin now; return whether any does.
 
         A node need not publish that its parameters changed, and its transitions may change them.
-
-        Returns:
-            Whether any is read.
         """
         nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:

@@ -87,8 +87,7 @@ def sweep(*, within_s: float = 0.0) -> tuple[str, ...]:
     What was made just now is left: its owner may not have locked it yet.
 
     Args:
-        within_s: seconds to try again while others still use what no process owns. They let go of
-            the port of a participant that left when they next send over shared memory.
+        within_s: seconds to try again while others still use what no process owns.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.

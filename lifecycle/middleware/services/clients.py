@@ -160,8 +160,7 @@ class NodeClients:
     ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
-        The request is sent once. While the reply is missing the container is asked now and then
-        what it has loaded: this node counts as the reply. So it is with what unloads.
+        The request is sent once; while the reply is missing, what the container has counts as one.
 
         Returns:
             What has the container unload it again; raises as this does.
@@ -299,8 +298,8 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Return whether a node has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service, and discovery shows one
-        participant's services in order: where it shows the latter alone, there are none.
+        Client libraries make them before the type description service: if that is shown alone,
+        there are none.
         """
         offered = self._observer.services_of(node)
         if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:

@@ -88,7 +88,7 @@ class ServiceCalls:
             timeout_s: seconds, > 0, for all of it.
             repeat: the request does no harm when it arrives twice.
             before: awaited when the first request is about to leave; what it raises keeps it back.
-            fields: of the request, as its class takes them.
+            fields: of the request.
 
         Raises:
             ServiceUnansweredError: at the deadline, or as soon as the service is forgotten once the
@@ -142,8 +142,7 @@ class ServiceCalls:
     async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
         """Return a client matched with every server, or long enough with some; None if none came.
 
-        It may be dropped meanwhile, with a node of that name that the graph shows to have left only
-        now: its successor is waited for by another one.
+        It may be dropped meanwhile, with a node of that name that has left: another one is made.
         """
         loop = asyncio.get_running_loop()
         offered_s: float | None = None
