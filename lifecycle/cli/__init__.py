@@ -163,10 +163,10 @@ def _check_ros(verb: str) -> None:
             f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
             hint=_ros_hint(),
         )
-    from lifecycle.middleware.process.shared_memory import check_room_to_load
+    from lifecycle.middleware.process.shared_memory import check_room
     from lifecycle.middleware.rcl.rmw_choice import check_rmw
 
-    check_room_to_load()
+    check_room()
     check_rmw(os.environ)
     if not os.environ.get("HOME"):
         from lifecycle.run_directory import home_directory

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from lifecycle.graph.model import EndpointChange as EndpointChange
     from lifecycle.graph.model import GraphChange as GraphChange
     from lifecycle.graph.model import Link as Link
-    from lifecycle.graph.model import NodeLiveliness as NodeLiveliness
     from lifecycle.graph.model import NodeView as NodeView
     from lifecycle.graph.reporter import GraphReporter as GraphReporter
     from lifecycle.graph.reporter import receive as receive
@@ -36,14 +35,7 @@ if TYPE_CHECKING:
 _PUBLIC: dict[str, tuple[str, ...]] = {
     "lifecycle.graph.events": ("EventKind", "GraphEvent", "GraphEvents"),
     "lifecycle.graph.graph": ("Graph",),
-    "lifecycle.graph.model": (
-        "End",
-        "EndpointChange",
-        "GraphChange",
-        "Link",
-        "NodeLiveliness",
-        "NodeView",
-    ),
+    "lifecycle.graph.model": ("End", "EndpointChange", "GraphChange", "Link", "NodeView"),
     "lifecycle.graph.reporter": ("GraphReporter", "receive"),
     "lifecycle.graph.state": ("GraphState",),
     "lifecycle.graph.status": (

@@ -54,11 +54,7 @@ class DiagnosticReadings:
         self._said: dict[str, HealthReport] = {}
 
     def listen(self, patterns: Mapping[str, tuple[str, ...]]) -> None:
-        """Follow the entries of nodes from now on.
-
-        Args:
-            patterns: of the names of their entries, by full node name.
-        """
+        """Follow the entries of nodes from now on, by patterns of their names."""
         with self._lock:
             # Looks at a part of the system go on beside those at all of it.
             self._patterns.update(patterns)

@@ -32,9 +32,9 @@ from lifecycle.verify.verdict import Stage, Verdict
 class Graph(Observer):
     """A ROS graph as it is now, and what happens in it.
 
-    Use `open` in a program that has no node, `on` in one that has. Callbacks come in a thread of
-    the graph's own, one after another; they must be quick. In a program that is one asyncio loop,
-    and judges the graph rather than following it, use `in_loop`. `close` it, or use it in a `with`.
+    Use `open` in a program that has no node, `on` in one that has, `in_loop` in one that judges the
+    graph in an asyncio loop. `close` it, or use it in a `with`. Callbacks come in a thread of the
+    graph's own, or in that loop, one after another; they must be quick.
 
     Attributes:
         events: layer 2.
@@ -80,13 +80,7 @@ class Graph(Observer):
 
     @classmethod
     def on(cls, node: Node) -> Graph:
-        """Follow the graph with a node that is there and that an executor spins.
-
-        Nothing is spun here: statuses and answers come while the node's executor runs. Close the
-        graph before the node is destroyed.
-
-        Args:
-            node: any rclpy node, a LifecycleNode for instance.
+        """Follow the graph with a node that an executor spins; close this before it is destroyed.
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
@@ -124,22 +118,16 @@ class Graph(Observer):
     def observation(self, plan: Plan) -> Observation:
         """Return what there is of `plan` now and what there is besides, for `lifecycle.verify`.
 
-        Planned nodes are asked again for their state and their configuration, which takes up to a
-        second for each that does not answer, all at once. Just after the graph was made it waits
-        until discovery is complete, up to 3.5 s. Not to be called in a callback, nor with
-        `in_loop`: there, `observe`.
+        Planned nodes are asked, all at once, which takes up to a second. Just after the graph was
+        made it waits until discovery is complete, up to 3.5 s. Not to be called in a callback, nor
+        with `in_loop`: there, `observe`.
         """
         if not self._loop.has_thread:
             raise TypeError("cannot wait for an observation in its own loop; await observe(plan)")
         return asyncio.run_coroutine_threadsafe(self.observe(plan), self._loop.bind()).result()
 
     def verdict(self, plan: Plan, *, stage: Stage = Stage.ACTIVE) -> Verdict:
-        """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`.
-
-        Args:
-            plan: of a manifest, `lifecycle.plan.build_plan`.
-            stage: ACTIVE, or CONNECTED before anything is activated.
-        """
+        """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`."""
         return verify(plan, self.observation(plan), stage=stage)
 
     # -- following

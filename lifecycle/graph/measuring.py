@@ -29,11 +29,7 @@ _DEPTH = 1000
 
 
 class TopicMeasurements:
-    """Counts what arrives on some topics, from their first message on.
-
-    Args:
-        clients: where they are subscribed to.
-    """
+    """Counts what arrives on some topics, from their first message on."""
 
     def __init__(self, clients: NodeClients) -> None:
         self._clients = clients

@@ -7,7 +7,6 @@ subscription. Whether two are matched is judged as `lifecycle.verify` judges it
 
 from __future__ import annotations
 
-import enum
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -24,13 +23,6 @@ from lifecycle.verify.transport import NONE, carrier
 from lifecycle.verify.view import SeenEndpoint
 
 
-class NodeLiveliness(enum.Enum):
-    """Whether a node of the graph is reached."""
-
-    ALIVE = "alive"
-    SILENT = "silent"
-
-
 class NodeView(msgspec.Struct, frozen=True, kw_only=True):
     """A node as it is known now.
 
@@ -45,11 +37,6 @@ class NodeView(msgspec.Struct, frozen=True, kw_only=True):
     status: NodeStatus | None = None
     silent: str = ""
     configuration: NodeConfiguration | None = None
-
-    @property
-    def liveliness(self) -> NodeLiveliness:
-        """Whether it is reached."""
-        return NodeLiveliness.SILENT if self.silent else NodeLiveliness.ALIVE
 
     @property
     def state(self) -> str | None:
@@ -110,16 +97,6 @@ class GraphChange(msgspec.Struct, frozen=True, kw_only=True):
         view = self.after or self.before
         assert view is not None
         return view.name
-
-    @property
-    def joined(self) -> bool:
-        """The node was not there before."""
-        return self.before is None
-
-    @property
-    def left(self) -> bool:
-        """The node is not there any more."""
-        return self.after is None
 
     @property
     def status_changed(self) -> bool:

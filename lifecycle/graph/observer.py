@@ -44,10 +44,8 @@ _logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-_BURST_S = (0.02, 0.1)
-_BURST_JUDGED_S = (0.005, 0.05)
-"""A burst of changes is over when nothing changed for so long, and is cut off after so long. Who
-judges waits less: bring-up is a race, and a look costs a few milliseconds."""
+_QUIET_S, _BURST_S = 0.005, 0.05
+"""A burst of changes is over when nothing changed for so long, and is cut off after so long."""
 
 FORGET_AFTER_S = 600.0
 """A node that was silent for so long has left."""
@@ -80,18 +78,14 @@ class Observer:
 
     Args:
         discovery: what is there.
-        clients: services of nodes.
+        clients: services of nodes; to be used in the loop.
         loop: where everything runs.
         unplanned: `observe` also asks nodes that are not planned, as far as they have our node
             interface.
 
     Attributes:
         state: layer 3.
-        discovery: what discovery shows.
-        clients: of nodes' services; to be used in the loop.
         changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
-        quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
-        burst_s: it is cut off after so long, ≥ quiet_s.
     """
 
     def __init__(
@@ -107,7 +101,6 @@ class Observer:
         self.discovery = discovery
         self.clients = clients
         self._loop = loop
-        self.quiet_s, self.burst_s = _BURST_S if loop.has_thread else _BURST_JUDGED_S
         self._unplanned = unplanned
         self._follows = loop.has_thread
         self._present: frozenset[str] = frozenset()
@@ -137,16 +130,13 @@ class Observer:
     ) -> Observation:
         """Return what is there now, as the state has it then.
 
-        Waits until every participant that was there before us is seen, which takes a moment at
-        first: an observation that misses one would prove nothing about undeclared nodes.
-
-        Planned nodes whose configuration was not put into the state are asked for their state and
-        their configuration; what they do not answer within a second stays unknown. Those that
-        report no parameters, and of which some are planned or waited for, are asked for these
-        (parameters.py).
+        Waits until every participant that was there before us is seen: an observation that misses
+        one would prove nothing about undeclared nodes. Planned nodes whose configuration was not
+        put into the state are asked for it and for their state; what they do not answer within a
+        second stays unknown. Parameters that they do not report are read (parameters.py).
 
         Args:
-            plan: see above.
+            plan: whose nodes are asked.
             only: full names of the planned nodes that are asked; None for all.
             machines: whose subscriptions are measured where the plan asks for it; None for all.
 
@@ -164,7 +154,7 @@ class Observer:
                 break
             # To look costs more than the moment in which the rest of a burst comes.
             if await set_within(self._changed, settling_s):
-                await asyncio.sleep(min(self.quiet_s, settling_s))
+                await asyncio.sleep(min(_QUIET_S, settling_s))
         self._show(nodes)
         given = self.state.given
         asked = (planned if only is None else planned.intersection(only)) - given.keys()
@@ -213,11 +203,11 @@ class Observer:
         """
         loop = self._loop.bind()
         await self._changed.wait()
-        end = loop.time() + self.burst_s
+        end = loop.time() + _BURST_S
         while (left_s := end - loop.time()) > 0:
             self._changed.clear()
             # Not at each change: while nodes come there is one for each of their endpoints.
-            await asyncio.sleep(min(self.quiet_s, left_s))
+            await asyncio.sleep(min(_QUIET_S, left_s))
             if not self._changed.is_set():
                 break
         self._changed.clear()
@@ -237,9 +227,8 @@ class Observer:
     ) -> dict[str, Answer]:
         """Ask wanted nodes, and those that are not planned if those are to be asked.
 
-        What nodes say of themselves that are in no host of ours is left out. On this machine a host
-        shows that it is one. Of another machine's nodes those count that the plan has in a host:
-        its supervisor started them there.
+        What nodes say of themselves that are in no host of ours is left out; on another machine
+        those count that the plan has in a host.
         """
         planned = {each.full_name: bool(each.run.python) for each in plan.nodes}
         asking = [self._ask(node) for node in nodes if node.full_name in wanted]

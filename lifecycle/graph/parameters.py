@@ -61,27 +61,17 @@ class ParameterReadings:
         self._named: dict[str, Names] = {}
 
     def listen(self, named: Mapping[str, Names]) -> None:
-        """Take each change of a named parameter as a reason to look again.
-
-        Args:
-            named: by full node name; without any, nothing is subscribed to.
-        """
+        """Take each change of a parameter that is named, by node, as a reason to look again."""
         # Looks at a part of the system go on beside those at all of it.
         self._named.update(named)
         if named:
             self._clients.on_parameters(self._arrived)
 
     async def follow(self, nodes: Collection[str], *, reporting: Collection[str]) -> bool:
-        """Read the named parameters of nodes from now on.
+        """Read the named parameters of nodes (full names) from now on; return whether it waited.
 
-        Waits for those that were never read, no longer than a node may take to answer.
-
-        Args:
-            nodes: full names, which have been listened for.
-            reporting: nodes that report their parameters themselves now; they are not read.
-
-        Returns:
-            Whether it has waited, so that what was seen before may be so no more.
+        It waits for those that were never read, no longer than a node may take to answer. Nodes
+        that are `reporting` their parameters themselves now are not read.
         """
         for name in reporting:
             self.forget(name)
@@ -116,12 +106,9 @@ class ParameterReadings:
             self.forget(name)
 
     def reread(self, node: str | None = None) -> bool:
-        """Have the next `follow` wait for readings that begin now; None for all nodes.
+        """Have the next `follow` wait for readings that begin now; return whether any does.
 
         A node need not publish that its parameters changed, and its transitions may change them.
-
-        Returns:
-            Whether any is read.
         """
         nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:

@@ -1,9 +1,8 @@
 """Sending and receiving node statuses over DDS, layer 1 of the graph interface.
 
 Owns: the graph topic's QoS, the publisher of a node that reports itself and the subscription of who
-follows a graph. One JSON document in each message, so that ordinary ROS tools can listen
-(`ros2 topic echo /lifecycle/graph`). DDS keeps the last status of each node for who comes later,
-sends again what was lost, and delivers a writer's statuses in their order.
+follows a graph: one JSON document in each message. DDS keeps the last status of each node for who
+comes later, sends again what was lost, and delivers a writer's statuses in their order.
 """
 
 from __future__ import annotations

@@ -30,7 +30,6 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.outcome import ConnectionReport
 
 _logger = logging.getLogger(__name__)
 
@@ -67,11 +66,6 @@ class GraphState:
         """Return what is known of a node (fully qualified); None if it is not in the graph."""
         with self._lock:
             return self._views.get(name)
-
-    def connections_of(self, node: str) -> tuple[ConnectionReport, ...]:
-        """Return the connections of a node; none if it is not known."""
-        view = self.node(node)
-        return () if view is None else view.connections
 
     def publishers_of(self, topic: str) -> tuple[End, ...]:
         """Return who publishes a topic (fully qualified)."""

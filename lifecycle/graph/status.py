@@ -3,9 +3,8 @@
 Owns: the message of the graph topic (schema: schemas/node_status.v1.schema.json). How it travels is
 reporter.py's. Pure.
 
-A status is all that its node has to say: the last one holds, whatever was lost before it, and what
-happened is the difference between two of them. See *Topological Discovery and Communication
-Negotiation* ("A Fork in the Features", "Graph Interface").
+A status is all that its node has to say: the last one holds, whatever was lost before it. See
+*Topological Discovery and Communication Negotiation*, "Graph Interface".
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         version: of this schema.
-        node: fully qualified name of the sender. It does not come from discovery: after a long
-            partition Fast DDS no longer knows it.
+        node: fully qualified name of the sender.
         instance: of the node: text that compares greater for one that was started later.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         connected: its data layer is made.

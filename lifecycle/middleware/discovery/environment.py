@@ -123,13 +123,7 @@ def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> f
 
 
 def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] | None) -> Reach:
-    """Return whom a participant can ask over one family.
-
-    Args:
-        domain_id: 0–232.
-        family: of its URLs.
-        environment: says who is looked for, and where; None where the URLs do.
-    """
+    """Return whom a participant can ask over one family; None for an environment: its URLs say."""
     kind = family.kind
     here = _addresses_of(kind)
     if environment is None:
@@ -199,11 +193,6 @@ def all_by_multicast(
     """Return whether all participants of a system can send their endpoints by multicast.
 
     So it is on one host, where no other is looked for by its address: routers pass no multicast.
-
-    Args:
-        machines: those of the system's nodes.
-        own: machines that are this host.
-        environment: where ROS_STATIC_PEERS is looked up.
     """
     return set(machines) <= set(own) and not environment.get(PEERS_VARIABLE)
 
@@ -222,17 +211,8 @@ def missing_port(
 ) -> int | None:
     """Return the UDP port of the multicast by which participants find each other, if it is missing.
 
-    Fast DDS shares that port with other participants. If another kind of socket has it, no
-    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
-    says nothing.
-
-    Args:
-        domain_id: of a participant of this process.
-        urls: its own.
-        environment: as for `reach`.
-
-    Returns:
-        None if this process has it, or participants look for each other elsewhere, too.
+    If another kind of socket has it, no participant of this host finds another, and Fast DDS 2.14
+    says nothing. None if this process has it, or participants look for each other elsewhere, too.
     """
     if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
         return None
@@ -297,13 +277,8 @@ def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
 def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
     """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
 
-    It looks at the first four participants of each, and only with the range SUBNET. Participants
-    without UDP over IPv4 would look for no others then, so where the user's settings take it
-    away, nothing is added.
-
-    Args:
-        hosts: IPv4 addresses.
-        environment: what it is now.
+    Participants without UDP over IPv4 would look for no others then, so where the user's settings
+    take it away, nothing is added.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
@@ -322,8 +297,7 @@ def discovery_peers(
         environment: where settings of Fast DDS are looked up.
 
     Returns:
-        Address and UDP port, the groups of multicast among them; nothing without hosts, or where
-        the user's own settings say how others are found.
+        Addresses and UDP ports; nothing where the user's own settings say how others are found.
     """
     if not hosts or chosen_otherwise(environment):
         return ()

@@ -2,12 +2,10 @@
 
 Owns: the topics by which participants assert their liveliness. A thread of ours asserts that of a
 MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive over a link that is
-cut. The reader's lease is the longest allowed time between assertions (DDS 1.4 §2.2.3.11), so many
-of them may be lost between. A callback that holds the interpreter's lock for longer expires it too.
+cut. A callback that holds the interpreter's lock for longer than the lease expires it too.
 
-Fast DDS 2.14 does not repeat an assertion that was lost on the way, so it is asserted this often.
-An AUTOMATIC writer would be asserted by Fast DDS's event thread, which stands still while a leaving
-peer's writer is removed.
+Fast DDS 2.14 does not repeat an assertion that was lost, so it is asserted this often. Its event
+thread, which would assert an AUTOMATIC writer, stands still while a leaving peer is removed.
 
 Beside which nodes are silent, a notice says when its sender received the last one of each other
 supervisor. So two of them exchange the four timestamps by which their clocks are compared

@@ -6,9 +6,8 @@ other has, no endpoints but those by which participants find each other, and it 
 once it has asked. Must not import rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
-the same host is often lost, and the participant that answered stays quiet for its next 3 s: a gate
-that opens meanwhile has not seen it. The prober joins once our participant does listen, and is
-answered at its own socket, which counts who answers, and at our participant's.
+the same host is often lost, and who answered is quiet for its next 3 s. The prober joins once our
+participant does listen, and is answered at its own socket, which counts, and at our participant's.
 """
 
 from __future__ import annotations
@@ -51,9 +50,7 @@ _INLINE_QOS, _DATA, _KEY = 0x02, 0x04, 0x08  # flags of DATA; 0x01 is little end
 _UDPV4, _UDPV6 = 1, 2  # LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6
 
 _LOCATOR = re.compile(rb"\x32\x00\x18\x00[\x01\x02]\x00\x00\x00(.{4})", re.DOTALL)
-"""PID_METATRAFFIC_UNICAST_LOCATOR over UDP, and its port."""
-_SWAPPED = re.compile(rb"\x00\x32\x00\x18\x00\x00\x00[\x01\x02](.{4})", re.DOTALL)
-"""The same of a big-endian participant."""
+"""PID_METATRAFFIC_UNICAST_LOCATOR over UDP, and its port; this host is little-endian."""
 
 
 def _parameters(*parameters: tuple[int, bytes]) -> bytes:
@@ -188,7 +185,6 @@ class Prober:
             return
         self._answers[prefix.hex()] = source[0]
         self.ports.update(int.from_bytes(each[1], "little") for each in _LOCATOR.finditer(data))
-        self.ports.update(int.from_bytes(each[1], "big") for each in _SWAPPED.finditer(data))
 
     def listeners(self) -> frozenset[OpenSocket]:
         """Return the UDP sockets of other processes on this host that are asked."""
@@ -315,8 +311,8 @@ class Settling:
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `left_s` wait for who came since; return whether there may be anybody.
 
-        On this host participants have sockets, and who has more of them than the graph shows
-        participants is not seen yet. On others they have to be asked.
+        Where this host has more new sockets than the graph shows new participants, one is not seen
+        yet. On other hosts they have to be asked.
 
         Args:
             everybody: wait also for what those have to say that are known: this process did not

@@ -18,8 +18,7 @@ from collections.abc import Iterator
 from lifecycle.middleware.fastdds.sockets import sockets_here
 
 _UNANSWERED = 2
-"""Retransmissions in a row after which a connection is dead for a leaving process: the kernel
-sends again after 0.2 s and 0.6 s at the earliest, and participants send something each 0.5 s."""
+"""Retransmissions in a row after which a connection is dead for a leaving process."""
 
 _SYN_SENT = 2  # tcp_states.h
 _ESTABLISHED = 1
@@ -30,8 +29,7 @@ _FIRST_REQUEST = 100
 """Bytes; the request by which Fast DDS begins has 68, and the next one 38 more."""
 
 _IDLE_MS = 500
-"""A connection in use says what it wants next within a millisecond of the first answer, and on a
-machine with both processors busy within 0.1 s."""
+"""A connection in use says what it wants next within 0.1 s of the first answer."""
 
 
 def give_up_dead_connections() -> int:
@@ -55,14 +53,9 @@ def _connections() -> Iterator[socket.socket]:
 
 
 def is_used(address: str, port: int) -> bool | None:
-    """Return whether the connection that this process dialled is used by Fast DDS.
+    """Return whether the connection that this process dialled there is used by Fast DDS.
 
-    Args:
-        address: IPv4, of the other end.
-        port: likewise.
-
-    Returns:
-        None while that is open: there is no connection yet, or it has only just begun.
+    None while that is open: there is no connection yet, or it has only just begun.
     """
     for each in _connections():
         with contextlib.suppress(OSError):  # not connected yet
@@ -72,8 +65,6 @@ def is_used(address: str, port: int) -> bool | None:
 
 
 def _is_used(info: bytes) -> bool | None:
-    if len(info) < _BYTES_RECEIVED + 8:
-        return True  # before Linux 4.2 it cannot be known
     (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
     acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
     if acked >= _FIRST_REQUEST:
@@ -101,9 +92,6 @@ _TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
 
 def send_again_soon() -> int:
     """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
-
-    What is dialled later waits as long as ever; those accepted by a socket that listens now do
-    not.
 
     Returns:
         How many sockets heed it: 0 before Linux 6.15, which has no such option.

@@ -161,9 +161,7 @@ def default_participant(xml: str) -> Iterator[None]:
         try:
             yield
         finally:
-            result = dds.set_default_qos(dds.factory(), before)
-            if result != _OK:
-                raise MiddlewareError(f"cannot restore the default profile: code {result}")
+            dds.set_default_qos(dds.factory(), before)
 
 
 def load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:

@@ -62,12 +62,9 @@ _UNIQUE_PORTS = range(7000, 7400)
 def get_network_flow_endpoints(entity: Publisher | Subscription) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of a publisher or subscription, as rmw lists them.
 
-    With Fast DDS a publisher's are its participant's sender sockets and a subscription's the
-    locators it listens on. Shared memory appears with protocol UNKNOWN and without an address, but
-    only among a subscription's: ask `has_shared_memory` for a publisher. An empty tuple means that
-    the endpoint cannot be reached over any network.
-
-    Ask a publisher only before its participant has peers, see `senders_of`.
+    With Fast DDS a publisher's are its participant's sender sockets, which are asked for before it
+    has peers (`senders_of`), and a subscription's the locators it listens on, shared memory among
+    them with protocol UNKNOWN and without an address. Empty: not reached over any network.
 
     Raises:
         MiddlewareError: this RMW has no such function, or the installed rcl is not known.
@@ -94,9 +91,8 @@ _SENDERS: weakref.WeakKeyDictionary[Context, tuple[NetworkFlowEndpoint, ...]] = 
 def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the sender sockets of a node's participant, which all its publishers have.
 
-    They do not change (see `lifecycle.middleware.fastdds.sockets`), and are asked for once in a
-    participant's life: do so before it has peers. Fast DDS 2.14 lists them without the lock under
-    which a thread of discovery extends the list for the first peer by shared memory or TCP
+    They are asked for once: do so before it has peers. Fast DDS 2.14 lists them without the lock
+    under which a thread of discovery extends the list for the first peer by shared memory or TCP
     (RTPSParticipantImpl::get_sending_locators).
 
     Raises:
@@ -140,12 +136,10 @@ def create_subscription(
 
     NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known. The
     others pass the option to the RMW; STRICTLY_REQUIRED then also demands proof, because some RMWs
-    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399. Destroy it
-    as any other, with `node.destroy_subscription`.
+    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399.
 
-    Fast DDS 2.14 gives the port (with its socket, two threads and about 170 kB) back only when the
-    participant ends, not with the subscription: whatever re-creates unique subscriptions again and
-    again does better with `FlowParticipant.create_subscription`.
+    Fast DDS 2.14 gives the port, with its socket and two threads, back only when the participant
+    ends: whatever re-creates unique subscriptions does better on a `FlowParticipant`.
 
     Args:
         node: created by rclpy; spun by any executor.
@@ -160,11 +154,11 @@ def create_subscription(
         MiddlewareError: not possible here; no endpoint is left.
     """
     profile = to_rclpy(qos)
-    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
+    if unique is UniqueRequirement.STRICTLY_REQUIRED and abi.refusal():
         hint = f"ask for optionally_required, or {INSTALL}"
         resolved = node.resolve_topic_name(topic)
         raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
-    if unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known():
+    if unique is UniqueRequirement.NOT_REQUIRED or abi.refusal():
         # Not by its class, which may do more with what its own code makes.
         return Node.create_subscription(node, type_, topic, callback, profile, **options)
     listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")

@@ -29,8 +29,7 @@ from lifecycle.middleware.fastdds import nfe, sockets
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.static_edp import check_endpoint
-from lifecycle.middleware.rcl import hidden_node
-from lifecycle.middleware.rcl.abi import is_known
+from lifecycle.middleware.rcl import abi, hidden_node
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
@@ -40,9 +39,8 @@ from lifecycle.network.nfe import NetworkFlowEndpoint
 class FlowParticipant:
     """One participant, one hidden node, and the endpoints that were given to it.
 
-    Nothing but the RMW's own discovery shares its sockets: the hidden node has no rosout, no
-    parameter services, no type description service and no parameter events. Publishers on it need
-    no executor. `destroy` it (or use it in a `with`); it does not end with the node it serves.
+    Nothing but the RMW's own discovery shares its sockets. `destroy` it (or use it in a `with`); it
+    does not end with the node it serves.
 
     Args:
         name: base name of the hidden node; by ROS custom it starts with an underscore.
@@ -90,7 +88,7 @@ class FlowParticipant:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
             # event publisher lists them before there is any publisher of the user's.
             probe = next(iter(self.node.publishers))
-            if self._dscp is not None or is_known():
+            if self._dscp is not None or not abi.refusal():
                 self._nfes = nfe.senders_of(self.node)
             # No socket of Fast DDS 2.14 opens later (see `sockets`).
             if self._dscp is not None:
@@ -106,14 +104,8 @@ class FlowParticipant:
     ) -> Publisher:
         """Create a publisher on this participant; `topic` should be fully qualified.
 
-        Events (matched, deadline, …) are handled where the node served is spun, else where
-        `self.node` is; without `event_callbacks` none are set up.
-
-        Args:
-            type_: message class.
-            topic: its name.
-            qos: the manifest's profile or rclpy's.
-            **options: of rclpy's `create_publisher`.
+        Its events are handled where the node served is spun, else where `self.node` is; without
+        `event_callbacks` none are set up. Options are those of rclpy's `create_publisher`.
         """
         self._check_static(type_, topic, writer=True)
         if not options.get("event_callbacks"):
@@ -136,9 +128,8 @@ class FlowParticipant:
     ) -> Subscription:
         """Create a subscription on this participant; `topic` should be fully qualified.
 
-        Its callback runs in the executor of the node served, else in that of `self.node`.
-        Its port is given back when the participant is destroyed, which is never for a unique
-        subscription on a node that stays. Arguments as `nfe.create_subscription`.
+        Its callback runs in the executor of the node served, else in that of `self.node`. Arguments
+        as `nfe.create_subscription`.
         """
         self._check_static(type_, topic, writer=False)
         if callback_group is None and self._served is not None:
@@ -197,11 +188,7 @@ class FlowParticipant:
         return min(found - {self._dscp}, default=min(found))
 
     def destroy(self) -> None:
-        """Destroy its endpoints, the hidden node and the participant; again is harmless.
-
-        Its ports are free as soon as an executor of another thread no longer waits for its
-        endpoints.
-        """
+        """Destroy its endpoints, the hidden node and the participant; again is harmless."""
         self._nfes = ()  # its ports may belong to another process from now on
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)

@@ -51,11 +51,9 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     Attributes:
         transports: all that it may use, UDPV4 and UDPV6; empty leaves it to the RMW, which
-            has shared memory and UDP over IPv4. Both means that messages for a peer that has both
-            go twice. Inside a process Fast DDS calls functions whatever the transports.
+            has shared memory and UDP over IPv4.
         max_datagram_bytes: largest UDP payload that it sends, 500–65500; longer messages are split
-            by RTPS (DATA_FRAG), so that IP has nothing to fragment. 1400 fits an Ethernet frame.
-            None leaves it to Fast DDS.
+            by RTPS (DATA_FRAG). None leaves it to Fast DDS.
         non_blocking_send: a send that finds the socket's buffer full drops the datagram instead of
             waiting: a reliable writer sends it again, a best effort one has lost it.
         connections: what it is connected to and by; with URLs `transports` must be empty, and its

@@ -4,9 +4,8 @@ Owns: the quick discovery profile, which is applied by an environment variable s
 any language inherit it; reading the default profile that is in force; and the XML elements that
 profiles are made of. Must not import rclpy.
 
-By default Fast DDS announces a new participant five times at 100 ms and then each 3 s, and drops
-one that ended without a word after 20 s. Endpoints are sent to each participant by itself, unless a
-profile asks for multicast (docs/performance.md has the measurements).
+By default Fast DDS announces a new participant five times at 100 ms and then each 3 s, and sends
+endpoints to each participant by itself (docs/performance.md has the measurements).
 """
 
 from __future__ import annotations
@@ -94,10 +93,8 @@ def discovery_environment(
     They count for participants created after they are set. A profile of the user's own is never
     replaced: then nothing is written and the result is empty.
 
-    Args:
-        directory: exists; it must outlive every process that is given the variables.
-        peers: see `discovery_profile`.
-        multicast_endpoints: see `discovery_profile`.
+    The directory must outlive every process that is given the variables; the rest is as for
+    `discovery_profile`.
 
     Raises:
         MiddlewareError: the file cannot be written.

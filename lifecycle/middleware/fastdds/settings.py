@@ -49,15 +49,8 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     An observer needs none, and a process that is killed while it holds the mutex of a port there
-    blocks each process that sends to it for 10 s at a time.
-
-    Args:
-        settings: what it needs otherwise.
-        super_client: it is to be, see ParticipantConnections.
-
-    Returns:
-        `settings`, where they, a profile or the environment say what transports it has, and with
-        another RMW or an unknown version of Fast DDS.
+    blocks each process that sends to it for 10 s at a time. It is chosen where these settings, a
+    profile or the environment say what transports there are, and by another RMW.
     """
     if get_rmw_implementation_identifier() != RMW or fast_dds_refusal():
         return settings
@@ -108,8 +101,8 @@ _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDic
 def has_shared_memory(node: Node) -> bool:
     """Return whether the participant of `node` has a shared memory transport.
 
-    It is seen when this package makes a participant. Of one that was made otherwise it is what the
-    process has: segments of Fast DDS in /dev/shm.
+    Of one that was made otherwise than by this package it is what the process has: segments of Fast
+    DDS in /dev/shm.
     """
     noted = _SHARED_MEMORY_OF.get(node.context)
     return bool(own_segments()) if noted is None else noted
@@ -119,7 +112,6 @@ def has_shared_memory(node: Node) -> bool:
 def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
     """Give the participant of `context` these settings: construct its first node in the block.
 
-    Everything is as before after the block, and later participants get what they always got.
     Participants that other contexts get inside the block have the settings as well.
 
     Args:

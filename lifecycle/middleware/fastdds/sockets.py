@@ -7,10 +7,9 @@ receives discovery. Sockets are found among a process's descriptors and in proc(
 rclpy.
 
 Fast DDS says nothing when a fixed port is taken or a whitelist matches nothing: the participant
-exists and receives nothing. Fast DDS 2.14 has no DSCP setting, always lists 0 in its network flow
-endpoints (NFEs) and exposes no socket; the socket option is what the kernel puts into packets. It
-needs no privilege. A participant's UDP sender sockets all exist before its first publisher does.
-TCP connections are opened later, are in no NFE list, and are not marked.
+receives nothing. It has no DSCP setting; the socket option, which needs no privilege, is what the
+kernel puts into packets. A participant's UDP sender sockets all exist before its first publisher
+does. TCP connections are opened later, are in no NFE list, and are not marked.
 """
 
 from __future__ import annotations
@@ -194,12 +193,8 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
 def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
     """Mark every socket of this process that `nfes` names, and read the marks back.
 
-    The mark is the socket's: everything the participant sends from it carries the mark, its
-    discovery as well. The two ECN bits of the byte stay 0.
-
-    Args:
-        nfes: of a publisher of this process.
-        dscp: 0–63.
+    Everything the participant sends carries the mark, 0–63, its discovery as well. The two ECN bits
+    of the byte stay 0.
 
     Raises:
         MiddlewareError: no socket found, or the kernel kept another value.
@@ -235,13 +230,9 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
 def widen_discovery_buffers(domain_id: int) -> int:
     """Give the sockets on which this process receives discovery room for many participants.
 
-    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: twenty
-    participants that announce their endpoints send four times as many, and what is lost is sent
-    again. Data keep their buffers: what waits in a large one is late. The kernel gives twice what
-    is asked for, and no more than twice net.core.rmem_max (socket(7)).
-
-    Args:
-        domain_id: 0–232; other ports than discovery's own of this domain stay as they are.
+    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: a quarter
+    of what twenty participants announce. Data keep their buffers: what waits in a large one is
+    late. The kernel gives no more than twice net.core.rmem_max (socket(7)).
 
     Returns:
         How many sockets have more room than before.

@@ -50,16 +50,16 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
 def check_endpoint(
     endpoints: Sequence[StaticEndpoint], *, writer: bool, profile: str, type_name: str
 ) -> None:
-    """Refuse an endpoint that is about to be made and that the table does not have.
+    """Refuse an endpoint that is about to be made and that no participant would ever find.
 
     Args:
-        endpoints: the participant's.
+        endpoints: the participant's lines in the table.
         writer: a writer, else a reader.
-        profile: the name by which rmw looks for its profile, the fully qualified topic name.
+        profile: the fully qualified topic name.
         type_name: DDS name of its type.
 
     Raises:
-        MiddlewareError: no participant would ever find it.
+        MiddlewareError: the table does not have it.
     """
     same_end = [each for each in endpoints if each.writer is writer]
     if any((each.profile, each.type) == (profile, type_name) for each in same_end):

@@ -121,8 +121,7 @@ def add_transports(
         found: all transports that it gets.
         domain_id: 0–232, for TCP's logical ports.
         non_blocking_send: on every UDP transport, whatever its URLs say.
-        localhost_peers: look for others on this host and on these only; for URLs that leave
-            discovery open. None leaves that to rmw.
+        localhost_peers: see `participant_profile.profile`.
     """
     urls = [url for family in found for url in family.urls]
     builtin = child(rtps, "builtin")

@@ -1,16 +1,14 @@
 """Hang detection between two processes: a page that one writes when it is busy and the other reads.
 
 Owns: the page of memory that the two processes share, and when the watcher looks at it. The busy
-one writes the time of day into the page, which costs less than a microsecond and no system call.
-The watcher looks once per limit, and when something that it saw may be over its limit: so neither
-the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps it from noticing then. Must not
-import rclpy.
+one writes the time into the page. The watcher looks once per limit, and when something that it saw
+may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps
+it from noticing then. Must not import rclpy.
 
-Time during which the thread could have run and got no processor is not its own: on an overloaded
-machine a callback of milliseconds takes seconds. The kernel counts it for each thread (run_delay of
-/proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up to its last turn. One that is
-ready to run hangs once it has run for long beyond the limit; another, once the limit has passed
-without what it waited for a processor.
+Time during which the thread could have run and got no processor is not its own. The kernel counts
+it for each thread (run_delay of /proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up
+to its last turn. One that is ready to run hangs once it has run for long beyond the limit; another,
+once the limit has passed without what it waited for a processor.
 
 The page has room for what the busy one does, in words, and the file behind it for where its threads
 stand (stacks.py).
@@ -111,15 +109,10 @@ class BusySign:
         """Have this process show where it stands, see `where`."""
         self._words[_ANSWERS] = stacks.answer(self._page)
 
-    def begin(self, after_s: float = 0.0, what: bytes = b"\0") -> None:
-        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before.
-
-        Args:
-            after_s: seconds.
-            what: is done; from `label`.
-        """
-        words = self._words
-        self._memory[_WHAT : _WHAT + len(what)] = what
+    def begin(self, after_s: float = 0.0, what: str = "") -> None:
+        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before."""
+        words, text = self._words, what.encode()[: _WHAT_BYTES - 1] + b"\0"
+        self._memory[_WHAT : _WHAT + len(text)] = text
         words[_THREAD] = -os.getpid() if self._of_process else threading.get_native_id()
         words[_SINCE] = time.monotonic_ns() + round(after_s * _NS)
 
@@ -204,11 +197,6 @@ class BusySign:
             self._memory.close()
             os.close(self._page)
             self._page = -1
-
-
-def label(text: str) -> bytes:
-    """Return what `BusySign.begin` takes."""
-    return text.encode()[: _WHAT_BYTES - 1] + b"\0"
 
 
 def _turns_of(thread: int, now: int) -> _Turns | None:

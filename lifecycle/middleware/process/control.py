@@ -27,8 +27,7 @@ def limit_resources(limits: Iterable[tuple[str, int]]) -> None:
     """Limit what this process may use, and all that it starts.
 
     Args:
-        limits: name and value of setrlimit(2), `RLIMIT_NOFILE` and the like. Both limits are set,
-            and that of processor time so that a signal ends it that says why.
+        limits: name and value of setrlimit(2), `RLIMIT_NOFILE` and the like.
 
     Raises:
         MiddlewareError: one is more than is allowed.

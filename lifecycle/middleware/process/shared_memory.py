@@ -34,7 +34,8 @@ _NEW_S = 0.1
 """Files of Fast DDS are locked by their owner within milliseconds."""
 
 _LEAST_ROOM_BYTES = 1 << 15
-"""Measured: with 4 KiB a participant ends by SIGBUS, with 64 KiB it does without."""
+"""Measured: with 4 KiB a participant ends by SIGBUS, with 64 KiB it does without. LTTng, which ROS
+2 links to, maps and writes two pages as it is loaded."""
 
 
 def holds_shared_memory() -> bool:
@@ -64,48 +65,20 @@ def own_segments() -> frozenset[str]:
 
 
 def check_room() -> None:
-    """Make sure that there is some room in /dev/shm at all.
+    """Make sure that there is some room in /dev/shm, before a library of ROS 2 is loaded.
 
     Raises:
-        MiddlewareError: there is so little that the kernel would end its users with SIGBUS.
+        MiddlewareError: there is so little that the kernel would end this process with SIGBUS.
     """
     with contextlib.suppress(OSError):
-        if (free := _free_bytes()) < _LEAST_ROOM_BYTES:
-            raise _no_room(free, "Fast DDS")
-
-
-_TRACING_BYTES = 8192
-_TRACING_FILES = "lttng-ust-wait-*"
-"""Two pages that LTTng, which ROS 2 links to, maps and writes to as it is loaded; they stay."""
-
-
-def check_room_to_load() -> None:
-    """Make sure that libraries of ROS 2 can be loaded, before any of them is.
-
-    Raises:
-        MiddlewareError: /dev/shm is so full that the kernel would end this process with SIGBUS.
-    """
-    with contextlib.suppress(OSError):
-        free = _free_bytes()
-        # st_blocks of stat(3type): in units of 512 bytes, whatever the file system has.
-        kept = sum(each.stat().st_blocks * 512 for each in _DIRECTORY.glob(_TRACING_FILES))
-        if free + kept < _TRACING_BYTES:
-            raise _no_room(free, "what ROS 2 loads and Fast DDS together")
-
-
-def _free_bytes() -> int:
-    there = os.statvfs(_DIRECTORY)
-    return there.f_bavail * there.f_frsize
-
-
-def _no_room(free: int, who: str) -> MiddlewareError:
-    verb = "need" if " and " in who else "needs"
-    return MiddlewareError(
-        f"cannot share memory: {str(_DIRECTORY)!r} has {free} bytes left, and {who} "
-        f"{verb} {_LEAST_ROOM_BYTES} at the very least",
-        hint="make room there, or give it more (mount -o remount,size=64m; in a container "
-        "--shm-size=64m)",
-    )
+        there = os.statvfs(_DIRECTORY)
+        if (free := there.f_bavail * there.f_frsize) < _LEAST_ROOM_BYTES:
+            raise MiddlewareError(
+                f"cannot share memory: {str(_DIRECTORY)!r} has {free} bytes left, and Fast DDS "
+                f"needs {_LEAST_ROOM_BYTES} at the very least",
+                hint="make room there, or give it more (mount -o remount,size=64m; in a container "
+                "--shm-size=64m)",
+            )
 
 
 def sweep(*, within_s: float = 0.0) -> tuple[str, ...]:
@@ -114,8 +87,7 @@ def sweep(*, within_s: float = 0.0) -> tuple[str, ...]:
     What was made just now is left: its owner may not have locked it yet.
 
     Args:
-        within_s: seconds to try again while others still use what no process owns. They let go of
-            the port of a participant that left when they next send over shared memory.
+        within_s: seconds to try again while others still use what no process owns.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.

@@ -26,9 +26,8 @@ def leave_and_exit(
 ) -> NoReturn:
     """Destroy what is given, flush the standard streams and end the process; never returns.
 
-    Executors must have stopped spinning. Destroying a participant can hang in Fast DDS with the
-    GIL held: at the deadline the process ends with the same code all the same, and its
-    supervisor sweeps /dev/shm (`lifecycle.middleware.process.shared_memory`).
+    Executors must have stopped spinning. Destroying a participant can hang in Fast DDS with the GIL
+    held: at the deadline the process ends with the same code, and its supervisor sweeps /dev/shm.
 
     Args:
         code: exit code, 0–255.

@@ -4,7 +4,7 @@ Owns: the struct layouts, the function signatures, and the check that the loaded
 ones these layouts were written for. Layouts are those of rcl 9 (ROS 2 Jazzy) and 10 (Kilted), both
 with rmw 7, on any 64-bit Linux; headers rcl/{publisher,subscription,wait,guard_condition}.h,
 rmw/{types,network_flow_endpoint}.h, rcutils/{allocator,error_handling}.h. With other libraries
-nothing is called: `is_known` says so, and what can be had from rclpy is taken from there.
+nothing is called: `refusal` says why, and what can be had from rclpy is taken from there.
 """
 
 from __future__ import annotations
@@ -201,10 +201,9 @@ class Rcl:
         return int(made)
 
     def _check_layout(self, version: str) -> None:
-        """Compare what the libraries put into our structs with what must be there.
+        """Compare the defaults that the libraries put into our structs with those of rmw and rcl.
 
-        The defaults are those of rmw_qos_profile_default and rcl_get_default_allocator; a field
-        that moved shows as a wrong default before anything is written through it.
+        A field that moved shows as a wrong default before anything is written through it.
         """
         expected = (1, 10, 1, 2, False, bytes(self.default_allocator), 0)
         options = self.call["rcl_subscription_get_default_options"]().options
@@ -286,11 +285,6 @@ def load() -> Rcl:
     if isinstance(loaded, MiddlewareError):
         raise MiddlewareError(loaded.message, hint=loaded.hint)
     return loaded
-
-
-def is_known() -> bool:
-    """Return whether the installed libraries are those that the layouts here are of."""
-    return not refusal()
 
 
 def refusal() -> str:

@@ -15,24 +15,6 @@ from rclpy.task import Task
 from rclpy.timer import Timer
 
 
-class Callback:
-    """One callback, or the next part of one that was suspended; call it to run it.
-
-    Attributes:
-        entity: what it is of; None for a task.
-    """
-
-    def __init__(self, task: Task, entity: Any) -> None:
-        self._task = task
-        self.entity = entity
-
-    def __call__(self) -> None:
-        """Run it; raises what it raises."""
-        self._task()
-        if (error := self._task.exception()) is not None:
-            raise error
-
-
 class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is not typed
     """Waits for the entities of its nodes and says which callback is next.
 
@@ -40,11 +22,12 @@ class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is no
         >>> executor = NodeExecutor(context=context)
         >>> executor.add_node(node)
         >>> while True:
-        ...     executor.next_callback()()
+        ...     task, entity = executor.next_callback()
+        ...     run(task)
     """
 
-    def next_callback(self) -> Callback:
-        """Wait for what is next.
+    def next_callback(self) -> tuple[Task, Any]:
+        """Wait for a callback, or the next part of one, and return it and what it is of, or None.
 
         Raises:
             ShutdownException: the executor was shut down.
@@ -55,11 +38,18 @@ class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is no
                 task, entity, _ = self.wait_for_ready_callbacks()
             except InvalidHandle:  # destroyed in another thread meanwhile
                 continue
-            return Callback(task, entity)
+            return task, entity
+
+
+def run(task: Task) -> None:
+    """Run a callback; raises what it raises."""
+    task()
+    if (error := task.exception()) is not None:
+        raise error
 
 
 def described(entity: Any) -> str:
-    """Return what a callback is of, in words; empty where there is nothing to say."""
+    """Return what a callback is of, in words; empty for a task."""
     try:
         if isinstance(entity, Subscription):
             return f"of the subscription of {entity.topic_name}"

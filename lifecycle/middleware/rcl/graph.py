@@ -87,9 +87,8 @@ Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 class GraphObserver:
     """What discovery shows of the graph of one domain, to a hidden node of its own.
 
-    Make it before starting what it is to see: a participant that is there already is found at
-    once. `destroy` it, or use it in a `with`. Every method may be called from any thread.
-    `GraphObserver.on` looks through a node that is there already.
+    Make it before starting what it is to see. `destroy` it, or use it in a `with`. Every method may
+    be called from any thread. `GraphObserver.on` looks through a node that is there already.
 
     Args:
         domain_id: 0–232.
@@ -148,8 +147,7 @@ class GraphObserver:
     def on(cls, node: Node) -> GraphObserver:
         """Look through a node that others spin, and destroy after this.
 
-        How its participant is connected is not known here, so that no participant can be asked to
-        announce itself: for the first 3.5 s a snapshot may miss some (`settling`).
+        Nobody can be asked here: for the first 3.5 s a snapshot may miss some (`settling`).
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
@@ -159,8 +157,7 @@ class GraphObserver:
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Have `callback` called in the guard's thread after each change of the graph.
 
-        It says that something changed, not what; simultaneous changes are reported as one. It must
-        be quick and must not destroy the observer.
+        It must be quick and must not destroy the observer.
 
         Returns:
             A function that takes the callback away again.
@@ -360,7 +357,7 @@ class GraphObserver:
             environment: variables that differ from these are reported.
 
         Returns:
-            By full node name, for each of its participants by GUID prefix (24 hex digits).
+            By full node name and GUID prefix (24 hex digits) of its participants.
         """
         from lifecycle.middleware.process.process_table import programs_of
 
@@ -423,10 +420,6 @@ class GraphObserver:
 
         It lists none of a node whose name it would not give, and of several of one name those of
         the first, which may have left.
-
-        Args:
-            counts: how many nodes of each name have topics.
-            ourselves: of which none are shown.
         """
         listed: dict[str, list[ObservedEndpoint]] = {}
         are_all = True
@@ -451,11 +444,6 @@ class GraphObserver:
         """Yield the endpoints of services on nodes of which rcl lists none.
 
         A node that is about to be known has them too; a plain DDS program never is one.
-
-        Args:
-            names: of the services.
-            listed: nodes whose services are known.
-            ends: see `service_ends`.
         """
         for name, kind in itertools.product(sorted(names), _OF_SERVICES):
             shown: set[str] = set()
@@ -471,9 +459,8 @@ class GraphObserver:
     ) -> Iterator[ObservedEndpoint]:
         """Yield one node's endpoints, its services with their hashes and its servers with GIDs.
 
-        The graph lists services by name and type only; their requests and replies are DDS topics
-        like all others, whose endpoints announce the hashes. A client has no GID: whoever asks may
-        ask with several.
+        Their requests and replies are DDS topics, whose endpoints announce the hashes. A client has
+        no GID: whoever asks may ask with several.
         """
         for each in endpoints:
             if each.kind not in _OF_SERVICES:

@@ -1,13 +1,11 @@
 """Graph changes without polling: rcl's guard condition, and whether a client's server is matched.
 
 Owns: the thread of each participant that sleeps on rcl's graph guard condition, which rclpy does
-not expose, while anybody follows the graph: a change wakes it within a millisecond. Where the
-installed rcl is not one whose layouts are known, it compares what rclpy shows twice a second.
+not expose, while anybody follows the graph. Where the installed rcl is not one whose layouts are
+known, it compares what rclpy shows twice a second.
 
-What may be taken for a match of a client: rmw_fastrtps counts its server only while its request
-writer has matched as many readers as its response reader has matched writers, at least one, and the
-graph knows as many servers by either (rmw_service_server_is_available.cpp); an action's server is
-that for all three services, and a publisher of feedback (rcl_action_server_is_available).
+rmw_fastrtps counts a client's server only while both its ends are matched, and as many as the graph
+knows of (rmw_service_server_is_available.cpp, rcl_action_server_is_available).
 """
 
 from __future__ import annotations
@@ -51,8 +49,7 @@ _GONE = (InvalidHandle, ValueError, rclpy_implementation.RCLError)
 class GraphGuard:
     """Calls back whenever discovery changes the graph that a participant sees; get it by `of`.
 
-    Changes that happen during callbacks are folded into one further call: level-triggered. It
-    costs a thread that sleeps, while there are callbacks.
+    Changes that happen during callbacks are folded into one further call.
 
     Attributes:
         failure: why the thread gave up; None while it works.
@@ -114,7 +111,7 @@ class GraphGuard:
                 self.notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
-        watch = _Guarded(node) if abi.is_known() else _Comparison(node)
+        watch = _Comparison(node) if abi.refusal() else _Guarded(node)
         self._watch, self.failure = watch, None
         watch.thread = threading.Thread(
             target=self._run, args=[watch], name="graph-guard", daemon=True

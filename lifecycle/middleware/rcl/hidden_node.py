@@ -1,10 +1,8 @@
 """Hidden nodes: a DDS participant with nothing on it but what was requested.
 
 Owns: how such a node and its context are made, and which of them this process has; showing an
-endpoint that was made there to the node that it serves. An executor asks its nodes for their
-entities each time it waits, and rcl waits for entities of any context together; so a moved endpoint
-is spun by whatever spins the node that it serves, now and later, is gated by that node's callback
-groups, and costs no thread and nothing while idle.
+endpoint that was made there to the node that it serves: whatever spins that node spins it, now and
+later, by that node's callback groups.
 """
 
 from __future__ import annotations
@@ -97,10 +95,9 @@ def republish_names(nodes: Iterable[Node]) -> None:
     """Make the participants of `nodes` publish anew which nodes and endpoints they have.
 
     After an outage rmw_dds_common keeps the name of a node whose participant was dropped, and found
-    again, out of the graph until then. rmw_fastrtps publishes it whenever a node or an endpoint is
-    made or destroyed. Here it is a hidden node without endpoints, for a moment: when an endpoint
-    ends, a discovery server of Fast DDS 2.14 drops whatever it has not relayed yet of that
-    participant's other endpoints, and never sends it again. Take one node of each participant.
+    again, out of the graph until then. rmw_fastrtps publishes it whenever a node is made. It has no
+    endpoints: when one ends, a discovery server of Fast DDS 2.14 drops for good what it has not
+    relayed yet of that participant's others. Take one node of each participant.
     """
     for node in nodes:
         bare_node(node.context).destroy_when_not_in_use()
@@ -162,13 +159,9 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
         entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
         host.add_waitable(entity)
         return
-    name = f"_{_KINDS[type(entity)]}s"
-    if not (hasattr(maker, name) and hasattr(host, name)):
-        if host.executor is not None:  # of another rclpy: all that is on the maker is spun there
-            host.executor.add_node(maker)
-        return
-    getattr(maker, name).remove(entity)
-    getattr(host, name).append(entity)
+    name, why = f"_{_KINDS[type(entity)]}s", "carry an endpoint by a connection"
+    private(maker, name, why).remove(entity)
+    private(host, name, why).append(entity)
     for handler in entity.event_handlers if isinstance(entity, Subscription) else ():
         maker.remove_waitable(handler)
         host.add_waitable(handler)

@@ -53,13 +53,7 @@ class NodeHooks(Protocol):
         """Wrap rclpy's constructor; yields the name and keywords to construct with."""
 
     def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
-        """Make an endpoint that a factory was asked for; None has rclpy make it.
-
-        Args:
-            node: whose it is to be.
-            kind: publisher or subscription.
-            arguments: of the factory, by name.
-        """
+        """Make a publisher or subscription that a factory was asked for; None has rclpy make it."""
 
     def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
         """One of a node's factories, or an action's constructor, is about to return."""
@@ -235,9 +229,9 @@ class RclpyStateMachine:
     """The state machine of one node of rclpy.lifecycle, driven by its own methods.
 
     It is guarded from the moment that rclpy has made the node: its class's constructor may ask for
-    transitions, too. Where a supervisor drives the node, the node's own code asks in vain for what
-    the supervisor does: it is SUCCESS where the node is there already, and FAILURE where the gate
-    is closed. By its services, and from its supervisor, the same request is an error.
+    transitions, too. Where a supervisor drives the node, the node's own code gets SUCCESS for what
+    is reached already, and FAILURE where the gate is closed. By its services, and from its
+    supervisor, the same request is an error.
 
     Args:
         node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.

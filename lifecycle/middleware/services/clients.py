@@ -53,7 +53,6 @@ TIMEOUT_S = 5.0
 _Reply = TypeVar("_Reply")
 
 _REREAD_S = 1.0
-_LEAST_S = 0.001
 _EVENT_DEPTH = 10
 _GOALS = {
     "configure": "inactive",
@@ -116,19 +115,12 @@ class NodeClients:
             timeout_s: for service, callback and reply together.
             before: awaited when the request is about to leave; what it raises keeps it back.
         """
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + timeout_s
         service = f"{node}/change_state"
-        if self._calls.open(service, ChangeState):
-            # The node drops its reply if it does not know this client's reader yet. It learns of
-            # our readers in order: a reply to one made later proves that it knows this one.
-            await self._calls.call(f"{node}/get_state", GetState, timeout_s, fresh=True)
-        left_s = max(deadline - loop.time(), _LEAST_S)
 
         async def ask() -> bool:
             wanted = Transition(label=transition)
             reply = await self._calls.call(
-                service, ChangeState, left_s, repeat=False, before=before, transition=wanted
+                service, ChangeState, timeout_s, repeat=False, before=before, transition=wanted
             )
             return bool(reply.success)
 
@@ -139,10 +131,7 @@ class NodeClients:
                 return None
             return True if state == _GOALS.get(transition) else None
 
-        try:
-            return await _reply(ask(), reached)
-        except ServiceUnansweredError as error:
-            raise ServiceUnansweredError(service, found=error.found, timeout_s=timeout_s) from error
+        return await _reply(ask(), reached)
 
     async def get_configuration(
         self, node: str, *, timeout_s: float = TIMEOUT_S, expected: bool = False
@@ -171,8 +160,7 @@ class NodeClients:
     ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
-        The request is sent once. While the reply is missing the container is asked now and then
-        what it has loaded: this node counts as the reply. So it is with what unloads.
+        The request is sent once; while the reply is missing, what the container has counts as one.
 
         Returns:
             What has the container unload it again; raises as this does.
@@ -310,8 +298,8 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Return whether a node has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service, and discovery shows one
-        participant's services in order: where it shows the latter alone, there are none.
+        Client libraries make them before the type description service: if that is shown alone,
+        there are none.
         """
         offered = self._observer.services_of(node)
         if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
@@ -353,10 +341,9 @@ class NodeClients:
         Args:
             node: that is wired.
             operation: "connect_to" makes a connection, "map_to" carries an endpoint by one,
-                "disconnect" removes one, "remap" gives an endpoint another name.
+                "disconnect" removes one.
             name: of the connection, or of the endpoint, `publishers/video`.
-            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own;
-                new name of remap.
+            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own.
             timeout_s: for the answer.
         """
         is_text = isinstance(value, str)

@@ -50,10 +50,7 @@ async def read_parameters(
         calls: makes the requests.
         node: fully qualified name.
         names: those that it has of these; None for all.
-        timeout_s: seconds, > 0, for each request.
-
-    Raises:
-        ServiceUnansweredError: no such service, or no answer.
+        timeout_s: seconds, > 0, for each request; raises as `ServiceCalls.call`.
     """
     import asyncio  # late: a host, which needs `parameter_value` only, has no use for it
 

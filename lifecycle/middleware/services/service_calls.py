@@ -29,12 +29,9 @@ _LONGEST_ATTEMPT_S = 2.0
 _MATCH_CHECK_S = 0.02
 """No event reports a match, which follows a moment after discovery shows the service."""
 _UNMATCHED_S = 0.5
-"""So long a service that is in the graph may keep its client unmatched before it is asked anyway.
-
-rmw_fastrtps calls a client ready only while all servers of the name, in the whole graph, are seen
-and matched by both their endpoints (it compares totals, rmw_service_server_is_available.cpp). One
-that cannot be matched, or that died while it was discovered, would hide the one that answers.
-"""
+"""So long a service that is in the graph may keep its client unmatched before it is asked anyway:
+rmw_fastrtps calls a client ready only while all servers of the name are matched
+(rmw_service_server_is_available.cpp), and one that cannot be would hide the one that answers."""
 
 
 class ServiceUnansweredError(MiddlewareError):
@@ -62,7 +59,7 @@ class ServiceCalls:
 
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
-        self._clients: dict[tuple[str, type[Any], bool], Client] = {}
+        self._clients: dict[tuple[str, type[Any]], Client] = {}
         self.group = ReentrantCallbackGroup()
         self._destroyed = False
         self._executor: SingleThreadedExecutor | None = None
@@ -80,7 +77,6 @@ class ServiceCalls:
         timeout_s: float,
         *,
         repeat: bool = True,
-        fresh: bool = False,
         before: Callable[[], Awaitable[None]] | None = None,
         **fields: Any,
     ) -> Any:
@@ -91,9 +87,8 @@ class ServiceCalls:
             type_: service class.
             timeout_s: seconds, > 0, for all of it.
             repeat: the request does no harm when it arrives twice.
-            fresh: by a client that is made now and dropped afterwards.
             before: awaited when the first request is about to leave; what it raises keeps it back.
-            fields: of the request, as its class takes them.
+            fields: of the request.
 
         Raises:
             ServiceUnansweredError: at the deadline, or as soon as the service is forgotten once the
@@ -101,7 +96,7 @@ class ServiceCalls:
         """
         deadline = asyncio.get_running_loop().time() + timeout_s
         try:
-            client = await self._usable(service, type_, deadline, fresh=fresh)
+            client = await self._usable(service, type_, deadline)
             if client is None:
                 raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
             if before is not None:
@@ -111,23 +106,14 @@ class ServiceCalls:
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
-        finally:
-            if fresh:
-                self._drop((service, type_, True))
         if answer is None:
             raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
         return answer
 
-    def open(self, service: str, type_: type[Any]) -> bool:
-        """Make the client of a service now; False if there is one already."""
-        is_new = (service, type_, False) not in self._clients
-        self._client(service, type_)
-        return is_new
-
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""
         for key in [key for key in self._clients if key[0].startswith(prefix)]:
-            self._drop(key)
+            self._observer.node.destroy_client(self._clients.pop(key))
 
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
@@ -146,29 +132,21 @@ class ServiceCalls:
                     self._executor.spin()
                     return
 
-    def _client(self, service: str, type_: type[Any], *, fresh: bool = False) -> Client:
-        client = self._clients.get((service, type_, fresh))
+    def _client(self, service: str, type_: type[Any]) -> Client:
+        client = self._clients.get((service, type_))
         if client is None:
             client = self._observer.node.create_client(type_, service, callback_group=self.group)
-            self._clients[service, type_, fresh] = client
+            self._clients[service, type_] = client
         return client
 
-    def _drop(self, key: tuple[str, type[Any], bool]) -> None:
-        client = self._clients.pop(key, None)
-        if client is not None:
-            self._observer.node.destroy_client(client)
-
-    async def _usable(
-        self, service: str, type_: type[Any], deadline: float, *, fresh: bool
-    ) -> Client | None:
+    async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
         """Return a client matched with every server, or long enough with some; None if none came.
 
-        It may be dropped meanwhile, with a node of that name that the graph shows to have left only
-        now: its successor is waited for by another one.
+        It may be dropped meanwhile, with a node of that name that has left: another one is made.
         """
         loop = asyncio.get_running_loop()
         offered_s: float | None = None
-        client = self._client(service, type_, fresh=fresh)
+        client = self._client(service, type_)
         while True:
             try:
                 if client.service_is_ready():
@@ -176,7 +154,7 @@ class ServiceCalls:
             except InvalidHandle:
                 if self._destroyed:
                     raise
-                client = self._client(service, type_, fresh=fresh)
+                client = self._client(service, type_)
                 continue
             now_s = loop.time()
             if not self._observer.node.count_services(service):

@@ -35,10 +35,10 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.process.busy_sign import BusySign, label
+from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.stacks import show_stacks_here
 from lifecycle.middleware.process.teardown import leave_and_exit
-from lifecycle.middleware.rcl.executor import NodeExecutor, described
+from lifecycle.middleware.rcl.executor import NodeExecutor, described, run
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import Watching
 from lifecycle.node.author.managed import Managed
@@ -61,7 +61,7 @@ class Watchdog:
         """Note that a callback begins, and of what it is; None for a task."""
         self._running = True
         if not self._changing:
-            self._sign.begin(what=label("" if entity is None else described(entity)))
+            self._sign.begin(what=described(entity))
 
     def end(self) -> None:
         """Note that it has ended."""
@@ -308,13 +308,13 @@ class NodeLoop:
             ShutdownException: the loop was closed.
             ExternalShutdownException: rclpy was shut down.
         """
-        callback = self._executor.next_callback()
+        callback, entity = self._executor.next_callback()
         if self._watchdog is None:
-            callback()
+            run(callback)
             return
-        self._watchdog.begin(callback.entity)
+        self._watchdog.begin(entity)
         try:
-            callback()
+            run(callback)
         finally:
             self._watchdog.end()
 

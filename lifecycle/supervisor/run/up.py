@@ -35,7 +35,7 @@ from lifecycle.middleware.fastdds.profiles import (
 )
 from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
 from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
-from lifecycle.middleware.process.shared_memory import check_room, sweep
+from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.connections.hosts import reached_hosts
@@ -437,7 +437,6 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     )
     check_memory()
     check_threads(THREADS)
-    check_room()
     from lifecycle.middleware.fastdds.unsupported import refuse_unsupported
 
     hosted = (each for each in plan.processes if each.run.kind is RunKind.PYTHON)

@@ -24,7 +24,6 @@ from std_srvs.srv import Trigger
 from lifecycle import codec
 from lifecycle.graph.events import EventKind, GraphEvent
 from lifecycle.graph.graph import Graph
-from lifecycle.graph.model import NodeLiveliness
 from lifecycle.graph.state import GraphState
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
@@ -168,16 +167,14 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
             first.wait(LIMIT_S)
             until(
                 graph,
-                lambda state: (
-                    (seen := state.node("/mortal")) and seen.liveliness is NodeLiveliness.SILENT
-                ),
+                lambda state: (seen := state.node("/mortal")) and seen.silent,
             )
         with process("mortal", "/mortal/t") as second:
             until(
                 graph,
                 lambda state: (
                     (seen := state.node("/mortal"))
-                    and seen.liveliness is NodeLiveliness.ALIVE
+                    and not seen.silent
                     and seen.instance > born.instance
                     and seen.configuration
                 ),

@@ -160,9 +160,7 @@ def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Observe
 
 @pytest.fixture
 def observer(graph: FakeGraph, clients: FakeClients) -> Observer:
-    observer = observing(graph, clients)
-    observer.quiet_s, observer.burst_s = 0.01, 0.05
-    return observer
+    return observing(graph, clients)
 
 
 def run(awaitable: Awaitable[T]) -> T:
@@ -327,7 +325,7 @@ def test_a_burst_is_waited_out_but_not_for_ever(observer: Observer, graph: FakeG
 
     cut_off_s, quiet_s = run_jumping(burst())
     assert cut_off_s == pytest.approx(0.05, abs=0.003)
-    assert quiet_s == pytest.approx(0.01, abs=0.003)
+    assert quiet_s == pytest.approx(0.005, abs=0.003)
 
 
 def test_a_transition_of_a_node_that_is_asked_wakes(

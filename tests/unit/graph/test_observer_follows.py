@@ -164,9 +164,9 @@ def test_a_node_that_is_silent_for_long_has_left() -> None:
         await world.show("/it")
         await world.say()
         await world.show()
-        assert [each.liveliness.value for each in world.state.nodes()] == ["alive"]
+        assert [each.silent for each in world.state.nodes()] == [""]
         await asyncio.sleep(1.0)  # no farewell came
-        assert [each.liveliness.value for each in world.state.nodes()] == ["silent"]
+        assert [bool(each.silent) for each in world.state.nodes()] == [True]
         await asyncio.sleep(FORGET_AFTER_S)
         assert world.state.nodes() == ()
 

@@ -13,7 +13,6 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     default_profile,
-    discovery_profile,
 )
 from lifecycle.plan.model import ParticipantConnections
 
@@ -108,19 +107,6 @@ def test_a_profile_of_the_users_is_kept_but_for_what_is_added(tmp_path: Path) ->
     assert ET.tostring(base.element) == before
 
 
-def test_quick_discovery_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "quick.xml"
-    path.write_text(discovery_profile())
-    base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
-    assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["10"]
-
-
-def test_an_observer_announces_itself_often_at_first() -> None:
-    root = made(ParticipantSettings(announces_often=True))
-    assert texts(root, ".//initialAnnouncements/count") == ["60"]
-    assert texts(root, ".//initialAnnouncements/period/nanosec") == ["50000000"]
-
-
 @pytest.mark.parametrize(
     ("protocol", "made_so"),
     [("CLIENT", "SUPER_CLIENT"), ("SIMPLE", "SIMPLE"), ("SERVER", "SERVER")],
@@ -173,13 +159,6 @@ def test_the_environments_choice_of_transports_is_not_replaced_by_a_default(
         "FASTDDS_BUILTIN_TRANSPORTS=UDPv6?non_blocking=true"
     )
     assert "UDPv4" in profile("p", UDP), "the manifest is more precise"
-
-
-def test_settings_that_need_nothing_are_false() -> None:
-    assert not ParticipantSettings()
-    assert UDP
-    assert ParticipantSettings(max_datagram_bytes=500)
-    assert ParticipantSettings(non_blocking_send=True)
 
 
 def test_without_a_file_there_is_no_default_profile(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import lifecycle
 from lifecycle.middleware.process import stacks
-from lifecycle.middleware.process.busy_sign import BusySign, label
+from lifecycle.middleware.process.busy_sign import BusySign
 
 OURS = str(Path(lifecycle.__file__).parent)
 STDLIB = sysconfig.get_path("stdlib")
@@ -62,7 +62,7 @@ def test_another_process_shows_where_it_stands_and_what_it_does() -> None:
         try:
             sign.show_stacks()
             stacks.show_stacks_here()
-            sign.begin(what=label("of the service /reset"))
+            sign.begin(what="of the service /reset")
             time.sleep(30)
         finally:
             os._exit(0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -50,15 +49,6 @@ def test_who_cannot_be_asked_announces_itself_each_half_second(url: str) -> None
 def test_who_can_be_asked_announces_itself_as_seldom_as_always() -> None:
     root = made("udpv4://10.77.0.1:7911?metatraffic_port=7910&multicast=off")
     assert root.findall(".//leaseAnnouncement") == []
-
-
-def test_over_tcp_the_thread_that_finishes_a_connection_overtakes_nobody() -> None:
-    root = made("tcpv4://10.77.0.1:5100")
-    policies = [
-        root.findtext(f".//transport_descriptor/{tag}/scheduling_policy")
-        for tag in ("accept_thread", "default_reception_threads")
-    ]
-    assert policies == [str(os.SCHED_BATCH), str(os.SCHED_OTHER)]
 
 
 def test_over_tcp_data_arrive_at_the_port_inside_a_connection_that_discovery_has() -> None:

@@ -19,7 +19,7 @@ class Sign:
         self.busy = False
         self.overlong: float | None = None
 
-    def begin(self, what: bytes = b"") -> None:
+    def begin(self, what: str = "") -> None:
         self.busy = True
 
     def end(self) -> float | None:
