@@ -346,9 +346,7 @@ def of_supervisors(
     def is_one(prefix: str, each: ObservedEndpoint) -> bool:
         if each.name == DIAGNOSTICS_TOPIC:
             return each.gid[:PREFIX_DIGITS] in diagnosing
-        offers = (each.kind, each.name) in allowed
-        others = prefix not in ours and _is_status(each.kind, each.name)
-        return prefix in believed and (offers or others)
+        return prefix in believed and ((each.kind, each.name) in allowed or prefix not in ours)
 
     return frozenset(each for prefix, each in found if is_one(prefix, each))
 
