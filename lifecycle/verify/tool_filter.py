@@ -261,21 +261,20 @@ def supervisor_prefixes(plan: Plan) -> frozenset[str]:
 
 def supervisor_endpoints(plan: Plan, machine: str = "") -> frozenset[tuple[EndpointKind, str]]:
     """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
-    access = plan.policy.access
-    if access is RosInterfaceAccess.OFF:
-        return frozenset()
-    found = _below(supervisor_prefix(plan.system, machine), plan, access)
+    found = _below(supervisor_prefix(plan.system, machine), plan, plan.policy.access)
     if machine:
         # Which mode a system is in that has several supervisors is not for one of them to say.
         found = frozenset(each for each in found if f"/{MODE_SERVICE}" not in each[1])
-    diagnostics = {(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC)} if takes_diagnostics(plan) else ()
-    return found.union(diagnostics)
+    diagnoses = found and takes_diagnostics(plan)
+    return found | ({(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC)} if diagnoses else set())
 
 
 def _below(
     prefix: str, plan: Plan, access: RosInterfaceAccess
 ) -> frozenset[tuple[EndpointKind, str]]:
     """Return what the supervisor with a prefix offers below it."""
+    if access is RosInterfaceAccess.OFF:
+        return frozenset()
     services = supervisor_services(access, (each.name for each in plan.modes))
     return frozenset(
         (
@@ -323,15 +322,11 @@ def of_supervisors(
         plan: of the system that is judged.
         endpoints: of tools.
     """
-    ours, access = supervisor_prefixes(plan), plan.policy.access
+    ours = supervisor_prefixes(plan)
     prefixes = {
         place: prefix for prefix in ours for place in _below(prefix, plan, RosInterfaceAccess.FULL)
     }
-    allowed = {
-        place
-        for prefix in (() if access is RosInterfaceAccess.OFF else ours)
-        for place in _below(prefix, plan, access)
-    }
+    allowed = {place for prefix in ours for place in _below(prefix, plan, plan.policy.access)}
     found: list[tuple[str, ObservedEndpoint]] = []
     claims: dict[str, tuple[set[str], set[str]]] = {}
     for each in endpoints:
@@ -344,27 +339,16 @@ def of_supervisors(
     believed = {
         prefix: participants
         for prefix, (nodes, participants) in claims.items()
-        if prefix and len(nodes) == 1 and len(participants) <= 1
+        if prefix and len(nodes) == 1 and len(participants) <= 1 and (allowed or prefix not in ours)
     }
-    diagnosing = {
-        each
-        for prefix, found in believed.items()
-        if prefix not in ours or access is not RosInterfaceAccess.OFF
-        for each in found
-    }
-    return frozenset(
-        each
-        for prefix, each in found
-        if (
-            takes_diagnostics(plan) and each.gid[:PREFIX_DIGITS] in diagnosing
-            if each.name == DIAGNOSTICS_TOPIC
-            else prefix in believed
-            and (
-                (each.kind, each.name) in allowed
-                or (prefix not in ours and _is_status(each.kind, each.name))
-            )
-        )
-    )
+    diagnosing = set().union(*believed.values()) if takes_diagnostics(plan) else set()
+
+    def is_one(prefix: str, each: ObservedEndpoint) -> bool:
+        if each.name == DIAGNOSTICS_TOPIC:
+            return each.gid[:PREFIX_DIGITS] in diagnosing
+        return prefix in believed and ((each.kind, each.name) in allowed or prefix not in ours)
+
+    return frozenset(each for prefix, each in found if is_one(prefix, each))
 
 
 def _is_observer(full_name: str) -> bool:

@@ -145,6 +145,15 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
         ),
         ["unverifiable graph.missing-node: /robot/camera, /robot/camera at 3:3"],
     ),
+    "a node of another machine is missing": (
+        Case(
+            "graph.missing-node",
+            drop_node("/one"),
+            planned(node("one", machine="far")),
+            machines=frozenset({"near"}),
+        ),
+        ["violated graph.missing-node: /one, /one at 3:3"],
+    ),
     "one name is that of two nodes, and of three reports": (
         Case(
             "graph.duplicate-node",

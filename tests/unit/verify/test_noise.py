@@ -206,8 +206,10 @@ def test_parts_of_another_type_make_no_action_and_stay_beside_one() -> None:
     some = parts()
     wrong = [replace(each, type="std_msgs/msg/String") for each in some[-2:]]
     assert fold_actions([*some[:-2], *wrong]) == (*some[:-2], *wrong)
-    action, *left = fold_actions([*some, *wrong])
-    assert (action.type, left) == ("robot/action/Dock", wrong)
+    goal = replace(some[0], type="z/action/Z_SendGoal")
+    for more in (wrong, [goal], [replace(some[-1]) for _ in range(3)]):
+        action, *left = fold_actions([*some, *more])
+        assert (action.type, left) == ("robot/action/Dock", more)
 
 
 def test_parts_of_an_action_client_that_is_there_already_are_no_second_one():

@@ -206,11 +206,6 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
         PLAN,
         ["violated connection.failed: /camera, /camera at 3:3"],
     ),
-    "a connection is to other URLs": (
-        reported("udpv4://", "udpv6://"),
-        with_urls("shm://", URL),
-        ["violated connection.differs: /camera, /camera at 3:3"],
-    ),
     "an own participant was connected otherwise": (
         change_configuration("/viewer", connections=OWN),
         own_urls("shm://"),

@@ -366,6 +366,7 @@ def test_a_run_that_nobody_judged_is_no_success_in_junit_and_sarif():
     root = ET.fromstring(to_junit(UNJUDGED, PLAN))
     assert root.get("failures") == "1"
     assert root.get("skipped") == str(len(RULES))
+    assert root.find(".//skipped").get("message") == "not judged; see the end of the run"
     (case,) = (each for each in root.iter("testcase") if each.find("failure") is not None)
     assert (case.get("classname"), case.get("name")) == ("run", "end")
     (run,) = json.loads(to_sarif(UNJUDGED))["runs"]

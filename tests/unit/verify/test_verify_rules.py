@@ -102,6 +102,10 @@ FIRES: dict[str, tuple[Edit, list[str]]] = {
         add_endpoint(ACTION_CLIENT, "/viewer", "/extra", type="a/action/B"),
         ["violated graph.undeclared-action-client: /extra"],
     ),
+    "a part of an action that is not declared": (
+        add_endpoint(PUB, "/viewer", "/lift/_action/feedback", gid="99"),
+        ["violated graph.undeclared-publisher: /lift/_action/feedback"],
+    ),
     "a publisher in a hidden participant that is not the owner's": (
         add_endpoint(PUB, "/robot/_camera_flow_0", "/extra", gid="99"),
         ["violated graph.undeclared-node: /robot/_camera_flow_0"],
@@ -200,19 +204,9 @@ SILENT: dict[str, Edit] = {
             add_endpoint(kind, "/viewer", name, type=type_, gid="")
             for kind, name, type_ in (
                 (PUB, "/rosout", "rcl_interfaces/msg/Log"),
-                (PUB, "/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
-                (SUB, "/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
-                (SUB, "/clock", "rosgraph_msgs/msg/Clock"),
                 (PUB, "/viewer/transition_event", "lifecycle_msgs/msg/TransitionEvent"),
                 (SERVER, "/viewer/get_parameters", "rcl_interfaces/srv/GetParameters"),
-                (SERVER, "/viewer/change_state", "lifecycle_msgs/srv/ChangeState"),
-                (
-                    SERVER,
-                    "/viewer/get_type_description",
-                    "type_description_interfaces/srv/GetTypeDescription",
-                ),
                 (SERVER, "/viewer/get_configuration", "std_srvs/srv/Trigger"),
-                (SERVER, "/viewer/disconnect", "rcl_interfaces/srv/SetParameters"),
                 (CLIENT, "/robot/camera/change_state", "lifecycle_msgs/srv/ChangeState"),
             )
         )
@@ -246,12 +240,6 @@ SILENT: dict[str, Edit] = {
     ),
     "a subscription's lifespan, which DDS does not have": change_announced_qos(
         SUB, STATUS, lifespan_ns=5
-    ),
-    "another order of everything": lambda seen: replace(
-        seen,
-        nodes=seen.nodes[::-1],
-        endpoints=seen.endpoints[::-1],
-        configurations=seen.configurations[::-1],
     ),
 }
 
@@ -617,6 +605,13 @@ def test_the_manifest_says_whose_nodes_may_listen(
         assert [each.describe() for each in verdict.tolerated] == [
             f"{name} (subscription of {STATUS})"
         ]
+
+
+def test_an_open_system_tolerates_who_publishes_too_and_says_so():
+    plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
+    guest = add_endpoint(PUB, "/guest", STATUS, gid="99", qos=QosProfile())
+    (found,) = verify(plan, guest(perfect(plan)), stage=Stage.CONNECTED).tolerated
+    assert (found.because, found.node) == ("undeclared_nodes: open", "/guest")
 
 
 @pytest.mark.parametrize(("subject", "name"), [("/robot/camera", "/robot/camera"), ("host", "")])
