@@ -41,7 +41,6 @@ from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.health.peers import FAILED, Peers
-from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.orphans import reap_adopted
@@ -106,6 +105,8 @@ class Supervisor:
 
     Attributes:
         authority: connects nodes; None where they connect themselves.
+        peers: the supervisors of other hosts.
+        looks: looks at the system, and judges it.
         moved: set, and replaced, at each input.
         changed: set, and replaced, whenever what a verdict looks at may be another.
         again: names of nodes that are started again, since the plan was last given to who connects.
@@ -139,17 +140,11 @@ class Supervisor:
         self.again: set[str] = set()
         self._begin(system.run)
         self.authority = authority_of(system, means.participant)
-        self._peers = Peers(system, means.participant)
+        self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
-        self.judge = Judge(
-            system,
-            means.participant.graph,
-            looker=self.authority,
-            peers=self._peers,
-        )
         self._processes = Processes(self)
         self._requests = Requests(self)
-        self._looks = Looks(self)
+        self.looks = Looks(self)
         self._ros_interface = RosInterface(self)
         self._server = ControlServer(means.directory.socket_path, self)
         self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
@@ -158,7 +153,7 @@ class Supervisor:
             effects.Spawn: self._processes.spawn,
             effects.Signal: self._processes.signal,
             effects.Sweep: self._processes.sweep,
-            effects.Look: self._looks.look,
+            effects.Look: self.looks.look,
             effects.Program: self._program,
             effects.Answer: self._answer,
             effects.Wake: self._wake_at,
@@ -202,7 +197,7 @@ class Supervisor:
         return SupervisorSnapshot(
             plan=self.system.expected,
             status=self.status(),
-            observation=self.judge.seen,
+            observation=self.looks.seen,
             verdict=self.system.run.judged.verdict,
         )
 
@@ -295,7 +290,7 @@ class Supervisor:
             self._end(run.ending)
             if run.is_over:
                 self._over.set()
-        elif self.system.remote and (left := self._peers.left()) != run.left:
+        elif self.system.remote and (left := self.peers.left()) != run.left:
             self.give(inputs.Saw(left=left))
 
     def _answer(self, effect: effects.Answer) -> None:
@@ -352,7 +347,7 @@ class Supervisor:
     def catch_up(self) -> None:
         """Take every change that has been noticed, and not been taken yet."""
         graph = self.means.participant.graph
-        if self._touched or graph.changes != self._graph_changes or self.judge.is_behind:
+        if self._touched or graph.changes != self._graph_changes or self.looks.is_behind:
             self._touched, self._graph_changes = False, graph.changes
             self.give(inputs.Changed())
             self._wake_looks()
@@ -424,9 +419,9 @@ class Supervisor:
             self.authority.replan(run.plan, again)
             run.early = configured_before_any_connect(self.system)
         self.means.networks.replan(run.plan)
-        self._peers.renew()
+        self.peers.renew()
         if run.first is not first:
-            self._peers.announce()
+            self.peers.announce()
 
     # What is said
 
@@ -493,7 +488,7 @@ class Supervisor:
     async def run(self) -> UpResult:
         """Bring the system up, hold it, and take it down; never leaves anything running."""
         await self._server.open()
-        self._peers.open()
+        self.peers.open()
 
         def changed(event: Event) -> None:
             if not isinstance(event, LogLine):
@@ -507,7 +502,7 @@ class Supervisor:
             asyncio.ensure_future(each)
             for each in (
                 self._follow_graph(),
-                self._looks.follow(),
+                self.looks.follow(),
                 self.answering.follow(),
                 self._watch_fork_server(),
                 self._watch_discovery_server(),
@@ -533,7 +528,7 @@ class Supervisor:
             await ended(*beside, *self._tasks)
             if self._wake is not None:
                 self._wake.cancel()
-            self.judge.close()
+            self.looks.close()
             self._ros_interface.close()
             run = result.verdict.run
             self._emit(
@@ -555,7 +550,7 @@ class Supervisor:
         latest = self.system.run.judged.verdict
         self._last = NOT_JUDGED if latest is None else self.system.liveliness.by_now(latest)
         how = FAILED if ending.failed else ""
-        self._peers.leave(f"{how}{ending.stopping}")
+        self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
@@ -580,7 +575,7 @@ class Supervisor:
     async def leave(self) -> None:
         """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
         self.means.participant.prepare_to_leave()
-        await self._peers.close()
+        await self.peers.close()
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:
