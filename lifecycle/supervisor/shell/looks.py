@@ -9,7 +9,7 @@ verdict means is the core's. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -286,7 +286,8 @@ class Looks:
         """Return the plan without silent nodes; the same object while that is the same."""
         of = self._system.plan, frozenset(self._system.liveliness.silent)
         if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
-            self._asked_of = (*of, without_nodes(*of))
+            nodes = tuple(each for each in of[0].nodes if each.full_name not in of[1])
+            self._asked_of = (*of, replace(of[0], nodes=nodes) if of[1] else of[0])
         return self._asked_of[2]
 
     def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
@@ -452,14 +453,6 @@ def without(observation: Observation, dead: frozenset[str]) -> Observation:
         configurations=tuple(each for each in observation.configurations if each.name not in gone),
         parameters=tuple(each for each in observation.parameters if each.node not in gone),
     )
-
-
-def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
-    """Return `plan` without the nodes that would not answer, so that they are not waited for."""
-    if not silent:
-        return plan
-    nodes = tuple(each for each in plan.nodes if each.full_name not in silent)
-    return replace(plan, nodes=nodes)
 
 
 def own_health(report: NodeConfiguration | None) -> HealthReport | None:

@@ -18,7 +18,6 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.manifest.model import Authority
 from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
@@ -53,7 +52,7 @@ from lifecycle.supervisor.run.events import (
     Stopped,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended, result_of
-from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
@@ -100,7 +99,6 @@ class Supervisor:
 
     Args:
         system: the part of a plan that this supervisor is responsible for.
-        options: what the person asked for.
         means: what it acts by.
 
     Attributes:
@@ -112,10 +110,9 @@ class Supervisor:
         again: names of nodes that are started again, since the plan was last given to who connects.
     """
 
-    def __init__(self, system: System, options: UpOptions, means: Means) -> None:
+    def __init__(self, system: System, means: Means) -> None:
         self.system = system
         self.means = means
-        self._options = options
         self._emit = system.emit
         self._loop = asyncio.get_running_loop()
         self._inbox: deque[inputs.Input] = deque()
@@ -138,8 +135,9 @@ class Supervisor:
         self.moved = asyncio.Event()
         self.changed = asyncio.Event()
         self.again: set[str] = set()
-        self._begin(system.run)
         self.authority = authority_of(system, means.participant)
+        if self.authority is not None:
+            system.run.early = configured_before_any_connect(system)
         self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
         self._processes = Processes(self)
@@ -161,30 +159,6 @@ class Supervisor:
         system.on_change = self._touch
         system.on_health = self._health
         system.liveliness.listen(self._silence)
-
-    def _begin(self, run: core.Run) -> None:
-        """Give the core what the person asked for."""
-        options, timeout_s = self._options, self._options.bring_up_s(len(run.processes))
-        hold_s = options.stop_after_s
-        if hold_s is None and options.until is not Until.ACTIVE:
-            hold_s = 0.0
-        wires = self.system.plan.data_layer.authority is Authority.SUPERVISOR
-        core.begin(
-            run,
-            core.Options(
-                until=core.Level.ACTIVE if options.until is Until.ACTIVE else core.Level.CONNECTED,
-                verifies=options.until is Until.VERIFIED,
-                hold_s=hold_s,
-                timeout_s=timeout_s,
-                gate_s=options.gate_s(timeout_s),
-                strict=options.strict,
-                keep_going=options.keep_going,
-                wires=wires,
-            ),
-        )
-        run.adopting = options.adopt
-        if wires:
-            run.early = configured_before_any_connect(self.system)
 
     # What others ask
 
@@ -218,7 +192,7 @@ class Supervisor:
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
-            check(order, self.system, self._options.machine)
+            check(order, self.system, self.system.run.options.machine)
         except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
         run, change = self.system.run, None
@@ -512,7 +486,7 @@ class Supervisor:
             each.add_done_callback(self._done)
         try:
             with self._signals():
-                if self._options.adopt:
+                if self.system.run.adopting:
                     self.start(self._adopt())
                 self.give(inputs.Tick())
                 try:
