@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
@@ -37,7 +38,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.health.peers import Peers
-from lifecycle.supervisor.judging.judge import Judge
+from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
@@ -194,9 +195,12 @@ class Supervised:
         self.state: Any = self
         self.discovery: Any = self
         self.settling: Any = self
-        self.judge = Judge(system, self, looker=None, peers=peers)  # type: ignore[arg-type]
+        participant = SimpleNamespace(graph=self)
+        means = SimpleNamespace(participant=participant)
+        shell: Any = SimpleNamespace(system=system, means=means, authority=None, peers=peers)
+        self.looks = Looks(shell)
 
-    async def observe(self, plan: Plan) -> Observation:
+    async def observe(self, plan: Plan, **_: object) -> Observation:
         """Give what nodes report, and look."""
         for each in self._configurations:
             self.put_configuration(each)
@@ -214,7 +218,7 @@ class Supervised:
     async def look(self) -> None:
         """Look and judge after one endpoint has gone or come back."""
         self.shown.turn += 1
-        await self.judge.look(Stage.ACTIVE, frozenset())
+        await self.looks.judge(Stage.ACTIVE)
 
 
 async def measure_look(plan: Plan, folder: Path) -> float:
@@ -226,7 +230,7 @@ async def measure_look(plan: Plan, folder: Path) -> float:
     for _ in range(LOOKS):
         await supervised.look()
     took_s = time.process_time() - begun
-    supervised.judge.close()
+    supervised.looks.close()
     return 1e3 * took_s / LOOKS
 
 

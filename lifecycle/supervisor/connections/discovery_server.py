@@ -176,7 +176,8 @@ def _answers(planned: PlannedServer, timeout_s: float) -> bool:
 def _failed(
     message: str, rule: Rule = START_FAILED, *, process: str = "", log: str = ""
 ) -> StepFailedError:
-    return StepFailedError(message, rule=rule, subject=NAME, process=process, log=log)
+    failure = Failure(rule=rule.id, subject=NAME, message=message, process=process, log=log)
+    return StepFailedError(failure)
 
 
 def _where(planned: PlannedServer) -> str:

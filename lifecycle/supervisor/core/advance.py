@@ -27,6 +27,7 @@ from lifecycle.supervisor.core.state import (
     held_level,
     limit_of,
 )
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.verdict import Stage
 
 SIGINT, SIGTERM, SIGKILL = 2, 15, 9
@@ -79,7 +80,7 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
     if node.base is Level.ACTIVE and node.level is Level.ACTIVE:
         return run.paused or bool(node.withheld)  # it is adopted as it was found
     asked = run.passage is not None and run.passage.lets_go(node.key)
-    if run.options.until < Level.ACTIVE:
+    if run.options.until is not Until.ACTIVE:
         return True
     if not asked and (run.paused or node.withheld or node.refused):
         return True
@@ -124,7 +125,7 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
     container = run.nodes.get(node.planned.run.container)
     if node.planned.run.component and container is not None and container.level < Level.STARTED:
         return f"{container.name} is started"
-    if target is Level.CONNECTED and run.options.wires and not node.wired:
+    if target is Level.CONNECTED and run.wires and not node.wired:
         # What a negotiation asks of a node must not wait for a connection of another.
         early = (run.nodes[key] for key in run.early if key in run.nodes)
         late = (each.name for each in early if each.level < Level.CONFIGURED)
@@ -250,7 +251,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
         passes = passage is not None and passage.opened and node.key in passage.waiting
         if not passes or run.is_changing or run.switch is not None or not gate.is_open(run):
             return None
-    if target is Level.CONNECTED and run.options.wires and not node.wired:
+    if target is Level.CONNECTED and run.wires and not node.wired:
         return Step.WIRE
     return UP[target]
 
@@ -336,8 +337,8 @@ def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
             process.state, process.end = ProcessState.STARTING, None
             process.started(run.now_s)
             yield effects.Spawn(process=process.name)
-    elif SIGKILL not in process.sent and run.is_past(_barks_at_s(process)):
-        process.barks, process.sent = True, [*process.sent, SIGKILL]
+    elif SIGKILL not in process.sent and run.is_past(_barks_at_s(run, process)):
+        process.sent = [*process.sent, SIGKILL]
         yield effects.Signal(process=process.name, number=SIGKILL)
     elif process.pid and is_to_end(run, process):
         yield from _end(run, process)
@@ -350,12 +351,13 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
     return not any(holds_up(run, each, Level.STARTED) for each in members)
 
 
-def _barks_at_s(process: Process) -> float:
-    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
+def _barks_at_s(run: Run, process: Process) -> float:
+    """Return when the watchdog of a process ends it; NEVER_S while none of its nodes hangs."""
     how = process.policy.how
-    if process.hangs_s is None or not how.watchdog_sec or how.restart is Restart.NO:
+    if not how.watchdog_sec or how.restart is Restart.NO:
         return NEVER_S
-    return process.hangs_s + how.watchdog_sec
+    members = run.nodes_of(process.name)
+    return min((each.hangs_s for each in members), default=NEVER_S) + how.watchdog_sec
 
 
 def _end(run: Run, process: Process) -> Iterator[effects.Signal]:

@@ -89,7 +89,7 @@ def settle_mode(run: Run) -> list[Event]:
     if not more:
         is_whole = phase_of(run) in ("measuring", "active")
         return [entered, *([SystemReached(reached="active", elapsed_s=run.now_s)] * is_whole)]
-    until_s = run.now_s + run.options.timeout_s
+    until_s = run.now_s + run.timeout_s
     run.passage = Passage(until_s=until_s, mode="" if switch.back else switch.before)
     return [entered]
 
@@ -124,8 +124,8 @@ def apply(run: Run, order: Order) -> list[Event]:
             for key, each in run.nodes.items()
             if each.level is Level.ACTIVE or (key in failed and not each.withheld)
         ),
-        timeout_s=order.timeout_s or run.options.timeout_s,
-        until_s=run.now_s + (order.timeout_s or run.options.timeout_s),
+        timeout_s=order.timeout_s or run.timeout_s,
+        until_s=run.now_s + (order.timeout_s or run.timeout_s),
         down=set(down),
         touched={*down, *change.added},
     )
@@ -150,7 +150,7 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
     assert change is not None
     events = [_said(run, "rolling_back", reason)]
     change.back, change.reason, change.code = True, reason, code
-    change.until_s = run.now_s + run.options.timeout_s
+    change.until_s = run.now_s + run.timeout_s
     run.passage = None
     if change.taken:
         change.taken = False

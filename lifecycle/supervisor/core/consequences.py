@@ -12,6 +12,7 @@ from lifecycle.supervisor.core.change import enter_mode
 from lifecycle.supervisor.core.failure import stop
 from lifecycle.supervisor.core.state import Level, Run
 from lifecycle.supervisor.run.events import ConsequenceTaken, Event
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -46,7 +47,7 @@ def settle_consequences(run: Run) -> list[Event]:
     if run.held_s is None or run.ending is not None or run.paused or verdict is None:
         run.judged.asked = {}
         return []
-    if busy or run.options.until < Level.ACTIVE:
+    if busy or run.options.until is not Until.ACTIVE:
         return []
     verdict = gate.of_those_there(run, gate.without(run, verdict, run.away | run.judged.away))
     run.judged.tried &= {each.key for each in verdict.findings}

@@ -37,6 +37,7 @@ from lifecycle.supervisor.run.events import (
     RestartScheduled,
     Stopping,
 )
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import missing, not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import Rule, rule
@@ -105,7 +106,8 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    hangs = next((each.hangs for each in members if each.hangs and process.barks), "")
+    barks = process.asked < 0 and bool(process.sent)  # nobody else has sent it anything then
+    hangs = next((each.hangs for each in members if each.hangs and barks), "")
     after_s = process.policy.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
     words = f": {given.words}" if given.words else ""
@@ -278,7 +280,7 @@ def _cut_short(run: Run, failure: Failure) -> None:
             run.change.again = failure.message
         if run.passage is not None:
             run.passage.at_gate = False
-            run.passage.until_s = run.now_s + run.options.timeout_s
+            run.passage.until_s = run.now_s + run.timeout_s
     elif order.ask is not ControlRequest.PAUSE:
         run.passage, run.switch, run.to_give = None, None, {}
         run.answer(ExitCode.BRING_UP_FAILED, failure.message)
@@ -292,7 +294,9 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     events: list[Event] = [goes_on(failure)]
     if due_s is None:
         history = tuple(process.failures)
-        events.append(GaveUp(process=process.name, restarts=process.restarts, history=history))
+        events.append(
+            GaveUp(process=process.name, restarts=process.policy.restarts, history=history)
+        )
         run.fails_now(_given_up(process, failure, was_up=was_up))
         return events
     keys = run.group(process.name)
@@ -302,14 +306,14 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
     if run.passage is not None and run.held_s is None:
-        run.passage.until_s = due_s + run.options.timeout_s
+        run.passage.until_s = due_s + run.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,
             nodes=tuple(run.nodes[key].name for key in keys),
             reason=failure.message,
             stderr=process.failures[-1].stderr,
-            restarts=process.restarts,
+            restarts=process.policy.restarts,
             in_s=due_s - run.now_s,
         )
     )
@@ -349,7 +353,7 @@ def end(run: Run, ending: Ending) -> list[Event]:
     """End the run: from now on everything is to be down. Whatever is open is answered."""
     if run.ending is not None:
         return []
-    restarts = [(each.name, each.restarts) for each in run.processes.values()]
+    restarts = [(each.name, each.policy.restarts) for each in run.processes.values()]
     said = [f"{name!r} {n} time{'s' * (n != 1)}" for name, n in restarts if n]
     summary = f"restarted: {', '.join(said)}" if said else ""
     reasons = (ending.reason, summary, gate.passed(run.judged))
@@ -405,13 +409,14 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
         latest, phase = run.judged.verdict, phase_of(run)
         why = unfinished(run) or (missing(latest) if latest and phase == "verifying" else "")
     else:
+        is_kept = phase_of(run) in ("measuring", "active", "paused", "pausing")
         asked = code
         code, why = _outcome(run, "")
         if asked in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             code = asked
         elif code is ExitCode.OK and run.options.hold_s is not None:
             code, why = asked, f"it did not hold for the {run.options.hold_s:g} s of --stop-after"
-        elif code is ExitCode.OK and run.options.until is Level.ACTIVE and not _is_kept(run):
+        elif code is ExitCode.OK and run.options.until is Until.ACTIVE and not is_kept:
             code, why = asked, f"the system was {phase_of(run)}, not active"
         elif code is ExitCode.OK and run.judged.counted:
             why = f"violated meanwhile, {run.judged.counted}"
@@ -419,19 +424,15 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
     return end(run, Ending(code=code, stopping=reason, reason=said))
 
 
-def _is_kept(run: Run) -> bool:
-    return phase_of(run) in ("measuring", "active", "paused", "pausing")
-
-
 def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
     """Return the exit code of a system that was held until now, and why it is no success."""
     verdict = run.judged.verdict
     if run.deaths:
         return ExitCode.BRING_UP_FAILED, _named(run.deaths)
-    if (run.options.until < Level.ACTIVE and not run.options.verifies) or verdict is None:
+    if run.options.until is Until.CONNECTED or verdict is None:
         return ExitCode.OK, ""
     left = follows_from_shut_down(run, verdict)
-    held = phase_of(run) == "held" and run.options.until is Level.ACTIVE
+    held = phase_of(run) == "held" and run.options.until is Until.ACTIVE
     closed = gate.closes(verdict, strict=run.options.strict) and not left
     down = ", ".join(each.name for each in run.processes.values() if each.failed)
     found = (
@@ -479,7 +480,7 @@ def exit_code_of(run: Run) -> ExitCode:
     return ExitCode.INTERRUPTED if run.hurry and code is ExitCode.OK else code
 
 
-def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
+def fail_late(run: Run, why: str) -> list[Event]:
     """Fail a bring-up, or an order, that takes too long: say what nodes were doing, or why."""
     busy = [
         each
@@ -488,7 +489,8 @@ def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
     ]
     culprit = busy[0] if busy else None
     subject = run.plan.system if culprit is None else culprit.name
-    text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run) or why}"
+    why = unfinished(run) or why
+    text = f"cannot bring up {run.plan.system!r} within {run.timeout_s:.3g} s: {why}"
     text += next(filter(None, (_advice(run, each) for each in run.nodes.values())), "")
     for node in busy:
         node.stuck = bool(node.process)
@@ -498,8 +500,7 @@ def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
     if run.passage is not None:
-        again_s = max(
-            run.passage.until_s, run.now_s + limit_s
-        )  # what is started again may be due later
+        # What is started again may be due later.
+        again_s = max(run.passage.until_s, run.now_s + run.timeout_s)
         run.passage.until_s = NEVER_S if run.failures else again_s
     return events

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -238,7 +239,7 @@ def _is_strangers(run: Run, finding: Finding) -> bool:
 
 def has_probation(run: Run) -> bool:
     """Return whether the manifest declares numbers of data that are to flow."""
-    return run.options.until is Level.ACTIVE and bool(run.plan.bounds)
+    return run.options.until is Until.ACTIVE and bool(run.plan.bounds)
 
 
 def is_measuring(run: Run) -> bool:

@@ -168,7 +168,7 @@ def _begin(run: Run, order: Order) -> list[Event]:
             _restart(run, order)
             run.pauses = run.paused
         opens = order.ask is ControlRequest.RESUME or not run.paused
-        until_s = run.now_s + run.options.timeout_s
+        until_s = run.now_s + run.timeout_s
         run.passage = Passage(until_s=until_s, activates=opens, judges=opens)
     run.changed()
     return []

@@ -38,7 +38,7 @@ def _arrive(run: Run) -> list[Event]:
     if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
         return _late(run, "nothing was started") if run.is_past(passage.until_s) else []
     left_s = passage.until_s - run.now_s
-    fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
+    fresh_s = run.timeout_s if run.held_s is not None else run.options.gate_s(left_s)
     if run.change is None:
         passage.until_s = run.now_s + fresh_s
     _is_at_gate(run, passage)
@@ -63,7 +63,7 @@ def _wait_again(run: Run) -> None:
     if busy or not (keys or run.again) or not advance.is_at_gate(run):
         run.passage = None
     elif run.passage is None:
-        run.passage = Passage(until_s=run.now_s + run.options.timeout_s, asked=False, at_gate=True)
+        run.passage = Passage(until_s=run.now_s + run.timeout_s, asked=False, at_gate=True)
         if keys and not gate.is_open(run):
             _is_at_gate(run, run.passage)
 
@@ -113,7 +113,7 @@ def _late(run: Run, why: str) -> list[Event]:
     """Give up what was to be at the gate, or through it, by now."""
     change = run.change
     if change is None or change.back:
-        return failure.fail_late(run, run.options.timeout_s, why)
+        return failure.fail_late(run, why)
     why = failure.unfinished(run) or why
     text = f"cannot bring up {run.plan.system!r} within {change.timeout_s:.3g} s: {why}"
     return go_back(run, text, ExitCode.BRING_UP_FAILED)
@@ -166,9 +166,11 @@ def _go_on(run: Run, passage: Passage) -> list[Event]:
         return [*events, *(_passed(run) if done else [])]
     until_s = max(passage.until_s, passage.begun_s + gate.LEAST_S)
     if run.is_past(gate.refuses_at_s(run, until_s)):
-        return _became_another(run) if done and passage.sent else _refused(run, again=True)
-    if run.is_past(max(passage.until_s, passage.begun_s + run.options.timeout_s)):
-        return failure.fail_late(run, run.options.timeout_s, "its gate was not passed")
+        became = done and bool(passage.sent)
+        stays = became and (run.change is None or run.change.back)
+        return _became_another(run) if stays else _refused(run, again=not became)
+    if run.is_past(max(passage.until_s, passage.begun_s + run.timeout_s)):
+        return failure.fail_late(run, "its gate was not passed")
     return []
 
 
@@ -258,9 +260,6 @@ def _became_another(run: Run) -> list[Event]:
     verdict, passage = run.judged.verdict, run.passage
     assert verdict is not None
     assert passage is not None
-    if run.change is not None and not run.change.back:
-        said = _withdraw(run)
-        return [*said, *go_back(run, gate.refusal(verdict), gate.exit_code(verdict))]
     if run.change is not None:
         run.passage = None
         run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"

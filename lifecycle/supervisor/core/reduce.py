@@ -35,6 +35,7 @@ from lifecycle.supervisor.core.state import (
     install,
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.rules.run import NOT_WIRED, START_FAILED, TRANSITION_FAILED
 
 _UPWARDS = (*UP.values(), Step.WIRE)
@@ -65,7 +66,8 @@ def _settle(run: Run) -> list[Event]:
     """Take what follows from the state alone one step further."""
     events: list[Event] = []
     passage, was_held = run.passage, run.held_s is not None
-    if run.ending is None and run.failures and _has_failed(run):
+    busy = any(each.request is not None for each in run.nodes.values())
+    if run.ending is None and run.failures and (not busy or run.is_past(run.fails_s)):
         events += failure.end_failed(run)
     _give_up_steps(run)
     _begin_anew(run)
@@ -142,7 +144,7 @@ def _is_down(node: Node) -> None:
     node.level = node.base = Level.DOWN
     node.request = None
     node.stuck = node.wired = node.healthy = node.let_through = node.appeared = False
-    node.silent, node.hangs, node.guarded = "", "", 0
+    node.silent, node.hangs, node.hangs_s, node.guarded = "", "", NEVER_S, 0
     node.shown = frozenset()
 
 
@@ -151,8 +153,7 @@ def _swept(run: Run, given: inputs.Swept) -> list[Event]:
     if process is None or process.state is not ProcessState.EXITED:
         return []
     process.state, process.pid, process.asked, process.sent = None, 0, -1, []
-    process.asked_until_s, process.hangs_s, process.sweeping = NEVER_S, None, False
-    process.barks = False
+    process.asked_until_s, process.sweeping = NEVER_S, False
     run.changed()
     if run.ending is not None or run.change is not None:
         return []
@@ -175,11 +176,7 @@ def _silent(run: Run, given: inputs.Silent) -> list[Event]:
     node.silent = given.why if given.away else ""
     run.changed()
     node.hangs = given.why if given.hangs else ""
-    process = run.process_of(node)
-    if process is not None:
-        since_s = run.now_s if process.hangs_s is None else process.hangs_s
-        hangs = any(each.hangs for each in run.nodes_of(process.name))
-        process.hangs_s = since_s if hangs else None
+    node.hangs_s = min(node.hangs_s, run.now_s) if given.hangs else NEVER_S
     return []
 
 
@@ -381,12 +378,6 @@ def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
 # What follows from the state alone
 
 
-def _has_failed(run: Run) -> bool:
-    """Return whether the run ends now: nothing is in a step, or a moment is over."""
-    busy = any(each.request is not None for each in run.nodes.values())
-    return not busy or run.is_past(run.fails_s)
-
-
 def _give_up_steps(run: Run) -> None:
     """Give up steps upwards of nodes that are to be down: their processes end."""
     for node in run.nodes.values():
@@ -446,7 +437,7 @@ def _hold(run: Run) -> list[Event]:
     )
     if failure.only_elsewhere(run) and not run.is_past(over_s + advance.NOTICE_S):
         return said  # who runs these may be about to say that it ends, too
-    if run.options.until < Level.ACTIVE and not run.options.verifies:
+    if run.options.until is Until.CONNECTED:
         waits = not (gate.allows(run) and gate.is_latest(run))
     if waits and not run.is_past(over_s + advance.GLANCE_S):
         return said
@@ -477,7 +468,7 @@ def _returned(run: Run) -> list[Event]:
                 Restarted(
                     process=process.name,
                     nodes=tuple(each.name for each in members),
-                    restarts=process.restarts,
+                    restarts=process.policy.restarts,
                     took_s=run.now_s - process.away_s,
                 )
             )

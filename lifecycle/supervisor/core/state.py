@@ -18,6 +18,7 @@ import msgspec
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
+    Authority,
     Condition,
     OnFailure,
     Readiness,
@@ -31,6 +32,7 @@ from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
+from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.verdict import FindingKey, FlowReport, Verdict
 
 NEVER_S = float("inf")
@@ -155,6 +157,7 @@ class Node(msgspec.Struct, kw_only=True):
         stuck: a request to it was given up; a further one would wait behind it.
         silent: why it cannot be reached; empty while it can.
         hangs: why its process's watchdog is to end it, if it has one; empty while it does not hang.
+        hangs_s: since when it does.
         shown: what others wait for of it, as far as the graph shows it.
         appeared: it has been in the graph, of one that is not in our host.
         renew: it is to go down once, whatever it is wanted to be.
@@ -175,6 +178,7 @@ class Node(msgspec.Struct, kw_only=True):
     stuck: bool = False
     silent: str = ""
     hangs: str = ""
+    hangs_s: float = NEVER_S
     shown: frozenset[Readiness] = frozenset()
     appeared: bool = False
     renew: bool = False
@@ -246,8 +250,6 @@ class Process(msgspec.Struct, kw_only=True):
         asked_until_s: then the next one is taken.
         sent: signals that it was sent.
         stays_down: it is not started again: it ended as it may, or the run goes on without it.
-        hangs_s: since when it is stopped or hangs; None while it does not.
-        barks: its watchdog ends it.
     """
 
     planned: PlannedProcess
@@ -266,18 +268,11 @@ class Process(msgspec.Struct, kw_only=True):
     asked_until_s: float = NEVER_S
     sent: list[int] = []
     stays_down: bool = False
-    hangs_s: float | None = None
-    barks: bool = False
 
     @property
     def name(self) -> str:
         """The planned name."""
         return self.planned.name
-
-    @property
-    def restarts(self) -> int:
-        """How often it was started again after a failure."""
-        return self.policy.restarts
 
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
@@ -473,28 +468,6 @@ class Ending(msgspec.Struct, kw_only=True):
         return "; ".join(each.message for each in self.failures) or self.reason
 
 
-class Options(msgspec.Struct, kw_only=True, frozen=True):
-    """What a person asked of the run.
-
-    Attributes:
-        until: how far the system is brought: CONNECTED; CONFIGURED stands for nothing.
-        verifies: with `until` CONNECTED: the gate is judged, and nothing let through.
-        hold_s: the system is held for so long; None until it is asked to end.
-        timeout_s: for a bring-up, and for each order.
-        gate_s: of these at the gate at most.
-        wires: an authority connects nodes between their configure and their connect.
-    """
-
-    until: Level = Level.ACTIVE
-    verifies: bool = False
-    hold_s: float | None = None
-    timeout_s: float = 30.0
-    gate_s: float = 30.0
-    strict: bool = False
-    keep_going: bool = False
-    wires: bool = False
-
-
 class Run(msgspec.Struct, kw_only=True):
     """One run of one system: all that its supervisor decides by.
 
@@ -526,7 +499,7 @@ class Run(msgspec.Struct, kw_only=True):
         wake_s: the next moment that something was asked about since the last input, see `is_past`.
     """
 
-    options: Options
+    options: UpOptions
     plan: Plan
     first: Plan
     nodes: dict[str, Node]
@@ -568,6 +541,16 @@ class Run(msgspec.Struct, kw_only=True):
     outbox: list[tuple[int, ExitCode, str]] = []
     wake_s: float = NEVER_S
     trusted: str = ""
+
+    @property
+    def timeout_s(self) -> float:
+        """Seconds for a bring-up, and for each order."""
+        return self.options.bring_up_s(len(self.processes))
+
+    @property
+    def wires(self) -> bool:
+        """Whether an authority connects nodes between their configure and their connect."""
+        return self.plan.data_layer.authority is Authority.SUPERVISOR
 
     @property
     def is_over(self) -> bool:
@@ -714,7 +697,7 @@ class Run(msgspec.Struct, kw_only=True):
         self.mark += 1
 
 
-def new_run(plan: Plan, options: Options, *, own: frozenset[str] | None = None) -> Run:
+def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None) -> Run:
     """Return a run that begins now, with nothing started.
 
     Args:
@@ -726,16 +709,13 @@ def new_run(plan: Plan, options: Options, *, own: frozenset[str] | None = None) 
     run.mode = plan.modes[0].name if plan.modes else ""
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
-    begin(run, options)
+    run.adopting = options.adopt
+    run.passage = Passage(
+        until_s=run.timeout_s,
+        judges=options.until is not Until.CONNECTED,
+        activates=options.until is Until.ACTIVE,
+    )
     return run
-
-
-def begin(run: Run, options: Options) -> None:
-    """Have a run of which nothing was started yet be as a person asks."""
-    active = options.until is Level.ACTIVE
-    judges = active or options.verifies
-    run.options = options
-    run.passage = Passage(until_s=options.timeout_s, activates=active, judges=judges)
 
 
 def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:

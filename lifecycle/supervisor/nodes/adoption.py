@@ -14,7 +14,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.run.events import Notice
+from lifecycle.supervisor.run.events import Failure, Notice
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.nodes import DUPLICATE_NODE
@@ -93,12 +93,11 @@ async def adopt(
         missing = [key for key in process.planned.nodes if key not in found]
         if 0 < len(missing) < len(process.planned.nodes):
             name = system.nodes[missing[0]].name
-            raise StepFailedError(
+            text = (
                 f"cannot start {name!r}: process {process.name!r} is to run it with others, which "
-                "run already; end those and all are started, or start it with them",
-                rule=START_FAILED,
-                subject=name,
+                "run already; end those and all are started, or start it with them"
             )
+            raise StepFailedError(Failure(rule=START_FAILED.id, subject=name, message=text))
     if not found:
         system.emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
     processes = participant.processes()

@@ -24,7 +24,7 @@ from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
-from lifecycle.supervisor.core.state import Level, Node, Options, Run, new_run
+from lifecycle.supervisor.core.state import Level, Node, Run, new_run
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
@@ -36,6 +36,7 @@ from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import HealthReport, NodeConfiguration
 from lifecycle.verify.rules.health import health_of
 
@@ -219,6 +220,7 @@ class System:
 
     Args:
         processes: those of the plan that this supervisor is responsible for.
+        options: what the person asked for.
         variables: set in every process, below what the plan sets.
         logs: the directory of the processes' log files.
 
@@ -247,10 +249,11 @@ class System:
         emit: Emitter,
         logs: Path,
         processes: Iterable[PlannedProcess],
+        options: UpOptions,
         variables: tuple[tuple[str, str], ...] = (),
     ) -> None:
         own = tuple(processes)
-        self.run: Run = new_run(plan, Options(), own=frozenset(each.name for each in own))
+        self.run: Run = new_run(plan, options, own=frozenset(each.name for each in own))
         self.expected = plan
         self.server: ManagedProcess | None = None
         self.emit = emit

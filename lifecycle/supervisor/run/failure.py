@@ -19,7 +19,7 @@ from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import Rule, rule
+from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.run import GAVE_UP, PROCESS_DIED, node_of
 from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
 
@@ -28,26 +28,11 @@ if TYPE_CHECKING:
 
 
 class StepFailedError(BringUpError):
-    """A step of bring-up failed that is no request to a node.
+    """A step of bring-up failed that is no request to a node; `failure` is all of it."""
 
-    Args:
-        message: a whole sentence.
-        rule: the `run.*` rule that it breaks.
-        subject: fully qualified node name, or what else is to blame.
-        process: name of the process concerned; empty if there is none of ours.
-        log: the file with all that its process wrote; empty if there is none.
-
-    Attributes:
-        failure: all of it.
-    """
-
-    def __init__(
-        self, message: str, *, rule: Rule, subject: str, process: str = "", log: str = ""
-    ) -> None:
-        super().__init__(message)
-        self.failure = Failure(
-            rule=rule.id, subject=subject, message=message, process=process, log=log
-        )
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(failure.message)
+        self.failure = failure
 
 
 def finding_of(failure: Failure) -> Finding:

@@ -37,9 +37,9 @@ from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
 from lifecycle.supervisor.health.liveliness import not_answering
-from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
+from lifecycle.supervisor.shell.grace_period import GracePeriod
 from lifecycle.verify.judge import apart_from_numbers, verify, with_findings, with_measured
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome

@@ -71,6 +71,12 @@ class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
     treatment: Treatment | None = None
     adopt: bool = False
 
+    @property
+    def hold_s(self) -> float | None:
+        """Seconds for which it is held once it is up; None until it is asked to end."""
+        stays = self.stop_after_s is not None or self.until is Until.ACTIVE
+        return self.stop_after_s if stays else 0.0
+
     def bring_up_s(self, processes: int) -> float:
         """Return the seconds for all of a bring-up that starts so many processes."""
         return TIMEOUT_S + processes * STARTING_S if self.timeout_s is None else self.timeout_s

@@ -173,6 +173,7 @@ def up(
                 emit=emit,
                 logs=logs,
                 processes=processes,
+                options=options,
                 # What a fork server that was started before `_enter_graph` has to pass on.
                 variables=tuple((n, os.environ[n]) for n in _GRAPH_VARIABLES if n in os.environ),
             )
@@ -190,7 +191,6 @@ def up(
                 emit(_started(system, observer_participant, str(logs)))
                 supervisor = Supervisor(
                     system,
-                    options,
                     Means(
                         directory=directory,
                         records=records,

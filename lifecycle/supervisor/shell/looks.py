@@ -1,29 +1,43 @@
-"""Looks when the core asks for it, and says what is seen of nodes that do not report: Look.
+"""Looks at the running system when the core asks for it, and judges what is there: Look.
 
-Owns: what is asked once more before a gate opens, which verdicts of a held system are kept back for
-a moment, and when to look again although nobody says that something changed.
+Owns: what a look asks and reads, what findings of others (the authority, other hosts, silent nodes)
+join the verdict, which verdicts of a held system are kept back for a moment, when to look again
+although nobody says that something changed, and what is seen of nodes that do not report. What a
+verdict means is the core's. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
-from lifecycle.measure.sample import SLOT_S
-from lifecycle.plan.model import PlannedNode
+from lifecycle.measure.sample import SLOT_S, Measured
+from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
-from lifecycle.supervisor.judging.grace_period import GracePeriod
-from lifecycle.supervisor.judging.judge import without
+from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.system import reached
+from lifecycle.supervisor.processes.scope import unlimited
+from lifecycle.supervisor.shell.grace_period import GracePeriod
+from lifecycle.supervisor.shell.standstill import Standstill
+from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.readiness import shown
-from lifecycle.verify.rules.health import health_of
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import About
+from lifecycle.verify.rules.health import UNHEALTHY, health_of
+from lifecycle.verify.rules.matching import UNKNOWN_PEER
+from lifecycle.verify.rules.measured import decided_by_clocks
+from lifecycle.verify.verdict import FindingKey, Stage, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.core.state import Passage
@@ -55,11 +69,23 @@ SHOWN_S = 0.5
 """The graph shows the state of a node of others within so long after it changed."""
 
 
+DISCOVERED_S = 3.5
+"""A participant whose first announcements were lost is discovered with the next one, after 3 s by
+default: a node of ours may be matched with it for so long before our participant knows it."""
+
+HEALTH_S = 5.0
+"""Who publishes its health does so within this time, or it counts as stale (graph/observer.py): a
+node that must be healthy, and has not said how it is, is waited for no longer."""
+
+
 class Looks:
     """Looks at the system of one supervisor.
 
     Args:
         shell: gets the inputs.
+
+    Attributes:
+        seen: what was seen last.
     """
 
     def __init__(self, shell: Supervisor) -> None:
@@ -73,10 +99,36 @@ class Looks:
         self._asked: Passage | None = None
         self._seen_last: inputs.Saw | None = None
         self._activated_s: dict[str, float] = {}
+        self._standstill = Standstill()
+        self._stills = 0
+        self._decided: frozenset[object] = frozenset()  # by clocks, as they were confirmed
+        self.seen = Observation()
+        self._unsaid: dict[str, float] = {}
+        self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
+        self._left: dict[str, float] = {}  # topics of processes that ended, and until when
+        self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
+        self._active_far: dict[str, float] = {}  # nodes of other machines, and since when
+        self._again: asyncio.TimerHandle | None = None
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether this process stood still since the last look began."""
+        return self._stills != self._standstill.count()
+
+    def left(self, topics: Iterable[str]) -> None:
+        """Note that a process with endpoints of these topics has ended."""
+        until_s = asyncio.get_running_loop().time() + FORGOTTEN_S
+        self._left.update(dict.fromkeys(topics, until_s))
+
+    def close(self) -> None:
+        """Judge no more."""
+        self._standstill.close()
+        if self._again is not None:
+            self._again.cancel()
 
     async def look(self, _: effects.Look) -> None:
         """Look and judge, once a burst of changes is over."""
-        run, judge = self._system.run, self._shell.judge
+        run = self._system.run
         loop = asyncio.get_running_loop()
         # While an open gate lets one level of nodes through after the other, each is looked at at
         # once; what the last of them report is on the way.
@@ -89,7 +141,7 @@ class Looks:
             self._shell.catch_up()
             mark, stage, away = run.mark, advance.stage_of(run), run.away
             began = dict(self._system.processes)
-            found = await judge.look(stage)
+            found = await self.judge(stage)
             closes = gate.closes(found, strict=run.options.strict)
             if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
                 break
@@ -102,7 +154,7 @@ class Looks:
             lately = loop.time() < newcomers_until_s
             if not (lately and self._graph.discovery.settling.expect_newcomers()):
                 break  # else the next look waits for them
-        self._saw(judge.seen, began)
+        self._saw(self.seen, began)
         self._was_stale = run.mark != mark
         self._shell.give(self._verified(mark, stage, away, found))
 
@@ -119,7 +171,7 @@ class Looks:
     def _verified(
         self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
     ) -> inputs.Verified:
-        run, judge = self._system.run, self._shell.judge
+        run, authority = self._system.run, self._shell.authority
         now_s = asyncio.get_running_loop().time()
         verdict, awaited_s, again_s = found, list[float](), list[float]()
         watched = run.held_s is not None and run.asked is None and run.opening is None
@@ -132,14 +184,15 @@ class Looks:
                 again_s.append(MEASURED_S if run.decided_s is not None else SLOT_S)
         self._latest = verdict
         closes = gate.closes(found, strict=run.options.strict)
-        if not closes and stage is Stage.CONNECTED and (left_s := judge.unsaid_s(found)) > 0:
+        if not closes and stage is Stage.CONNECTED and (left_s := self._unsaid_s(found)) > 0:
             awaited_s.append(left_s)
-        if judge.asks_again(found):
+        if self._asks_again(found):
             if run.asked is not self._asked:
                 self._asked, self._again_s = run.asked, ASK_AGAIN_S
             again_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
-        if run.change is not None and judge.is_reconciling:
+        if run.change is not None and authority is not None and authority.is_at_work():
+            # The authority has still to make what running nodes lack.
             awaited_s.append(ASK_AGAIN_AT_MOST_S)
         return inputs.Verified(
             mark=mark,
@@ -155,6 +208,143 @@ class Looks:
         until_s = loop.time() + BURST_S
         while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
             pass
+
+    # One verdict
+
+    async def judge(self, stage: Stage) -> Verdict:
+        """Look and judge now.
+
+        Args:
+            stage: what the system has reached.
+        """
+        if self._stills != (stills := self._standstill.count()):
+            # What arrived meanwhile was not taken in: who came has to be asked for.
+            self._stills = stills
+            self._graph.discovery.settling.expect_newcomers(everybody=True)
+        system = self._system
+        await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
+        seen = await self._graph.observe(self._plan_asked(), machines=system.machines)
+        observation = without(seen, system.dead())
+        run = system.run
+        is_measured = run.held_s is not None and run.passage is None
+        if is_measured:
+            observation = replace(
+                observation, clocks=self._shell.peers.clocks(), marks=self._shell.peers.marks()
+            )
+        observation = self._with_far_activity(observation)
+        self.seen = observation
+        system.present = arrivals(system.present or (), observation, system.emit)
+        if self._shell.authority is not None:
+            self._shell.authority.look(observation)
+        expected = system.expected
+
+        def verified(observation: Observation) -> Verdict:
+            return verify(
+                expected,
+                observation,
+                stage=stage,
+                machines=system.machines,
+                ahead=system.run.ahead,  # as of now: some are activated meanwhile
+                over=system.over(),
+            )
+
+        verdict = verified(observation)
+        if not decided_by_clocks(verdict.measured) <= self._decided:
+            await self._shell.peers.compare_clocks()
+            self.seen = replace(observation, clocks=self._shell.peers.clocks())
+            verdict = verified(self.seen)
+        self._decided = decided_by_clocks(verdict.measured)
+        self._shell.peers.follow(verdict.flows)
+        # Where nothing is declared, hosts do not report what they count.
+        if not is_measured or not (expected.bounds or observation.marks):
+            verdict = without_measured(verdict, expected.policy)
+        verdict = self._without_passing_peers(verdict, stage)
+        limits = unlimited(each.planned for each in system.run.processes.values())
+        wiring = () if self._shell.authority is None else self._shell.authority.findings()
+        verdict = with_findings(
+            verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
+        )
+        verdict = self._shell.peers.explained(verdict)
+        more = (*self._shell.peers.findings(observation), *discovery_server.findings(system))
+        return with_findings(verdict, more, expected.policy)
+
+    def _with_far_activity(self, observation: Observation) -> Observation:
+        """Return what was seen, with how long nodes of other machines are seen to be active."""
+        far = {each.full_name for each in self._system.remote.values()}
+        seen, now_s = observation.configurations, asyncio.get_running_loop().time()
+        active = [each.name for each in seen if each.name in far and each.state in ("", ACTIVE)]
+        self._active_far = {name: self._active_far.get(name, now_s) for name in active}
+        timed = (
+            replace(each, measured=Measured(active_s=now_s - self._active_far[each.name]))
+            if each.name in self._active_far
+            else each
+            for each in seen
+        )
+        return replace(observation, configurations=tuple(timed)) if active else observation
+
+    def _plan_asked(self) -> Plan:
+        """Return the plan without silent nodes; the same object while that is the same."""
+        of = self._system.plan, frozenset(self._system.liveliness.silent)
+        if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
+            nodes = tuple(each for each in of[0].nodes if each.full_name not in of[1])
+            self._asked_of = (*of, replace(of[0], nodes=nodes) if of[1] else of[0])
+        return self._asked_of[2]
+
+    def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
+        """Return a verdict without peers that the graph cannot explain yet, or any longer.
+
+        Over TCP an end counts a peer that was killed until its lease runs out, and nothing can
+        take it away before. Behind the gate a newcomer has DISCOVERED_S to be discovered.
+        """
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        self._left = {topic: at for topic, at in self._left.items() if at > now_s}
+        found = {each.key: each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
+        self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
+        until_s = {}
+        for key, since_s in self._unknown_peers.items():
+            least_s = since_s + DISCOVERED_S if stage is Stage.ACTIVE else now_s
+            until_s[key] = max(least_s, self._left.get(found[key].subject, now_s))
+        passing = {key: at for key, at in until_s.items() if at > now_s}
+        if not passing:
+            return verdict
+        if self._again is not None:
+            self._again.cancel()
+        self._again = loop.call_at(min(passing.values()), self._system.touch)
+        dropped = [found[key] for key in passing]
+        return without_findings(verdict, dropped, self._system.expected.policy)
+
+    def _unsaid_s(self, verdict: Verdict) -> float:
+        """Return for how long the health is waited for of nodes that have not said how they are.
+
+        Once for each: who says nothing for so long is taken on trust, if the policy allows it.
+        """
+        now_s = asyncio.get_running_loop().time()
+        unsaid = {
+            each.node
+            for each in verdict.findings
+            if each.rule == UNHEALTHY.id and each.outcome is Outcome.UNVERIFIABLE
+        }
+        self._unsaid = {node: self._unsaid.get(node, now_s) for node in unsaid}
+        return max((since + HEALTH_S - now_s for since in self._unsaid.values()), default=0.0)
+
+    def _asks_again(self, verdict: Verdict) -> bool:
+        """Whether something is missing that nobody would report once it is there.
+
+        A match that no node would report: hosts report theirs, and what a node of another machine
+        said of it may be from when the link was cut. Or a step of another supervisor's node.
+        """
+        others = {each.full_name for each in self._system.remote.values()}
+        reporting = {each.name for each in self._system.nodes.values() if each.is_hosted}
+        return any(
+            (rule(each.rule).about is About.PROGRESS and each.node in others)
+            or (
+                each.outcome is Outcome.VIOLATED
+                and rule(each.rule).about is About.MATCH
+                and (reporting.isdisjoint(each.nodes) or not others.isdisjoint(each.nodes))
+            )
+            for each in verdict.findings
+        )
 
     # Nodes that do not report
 
@@ -242,6 +432,27 @@ class Looks:
             self._activated_s[key] = now_s
             asyncio.get_running_loop().call_later(SHOWN_S, self._system.touch)
         return is_news
+
+
+def without(observation: Observation, dead: frozenset[str]) -> Observation:
+    """Return `observation` without the ghosts of dead nodes; a second node of the name stays."""
+    if not dead:
+        return observation
+    alive = {
+        node.full_name for node in observation.nodes if node.full_name in dead and node.count > 1
+    }
+    gone = dead - alive
+    return replace(
+        observation,
+        nodes=tuple(
+            replace(node, count=node.count - 1) if node.full_name in alive else node
+            for node in observation.nodes
+            if node.full_name not in gone
+        ),
+        endpoints=tuple(each for each in observation.endpoints if each.node not in gone),
+        configurations=tuple(each for each in observation.configurations if each.name not in gone),
+        parameters=tuple(each for each in observation.parameters if each.node not in gone),
+    )
 
 
 def own_health(report: NodeConfiguration | None) -> HealthReport | None:

@@ -136,7 +136,7 @@ class Processes:
         end = process.ended.result()
         carried = system.carried_by(process.name)
         self.forget(process.pid, carried)
-        self._shell.judge.left(each.resolved for node in carried for each in node.planned.endpoints)
+        self._shell.looks.left(each.resolved for node in carried for each in node.planned.endpoints)
         self._shell.give(
             inputs.Exited(
                 process=process.name,
@@ -194,7 +194,7 @@ class Processes:
                 process=effect.process,
                 reported={
                     each.name: {report.name: report.urls for report in each.connections}
-                    for each in self._shell.judge.seen.configurations
+                    for each in self._shell.looks.seen.configurations
                     if each.name not in names
                 },
             )

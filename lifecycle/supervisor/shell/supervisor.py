@@ -18,7 +18,6 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.manifest.model import Authority
 from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
@@ -41,7 +40,6 @@ from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.health.peers import FAILED, Peers
-from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.orphans import reap_adopted
@@ -54,7 +52,7 @@ from lifecycle.supervisor.run.events import (
     Stopped,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended, result_of
-from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
@@ -101,20 +99,20 @@ class Supervisor:
 
     Args:
         system: the part of a plan that this supervisor is responsible for.
-        options: what the person asked for.
         means: what it acts by.
 
     Attributes:
         authority: connects nodes; None where they connect themselves.
+        peers: the supervisors of other hosts.
+        looks: looks at the system, and judges it.
         moved: set, and replaced, at each input.
         changed: set, and replaced, whenever what a verdict looks at may be another.
         again: names of nodes that are started again, since the plan was last given to who connects.
     """
 
-    def __init__(self, system: System, options: UpOptions, means: Means) -> None:
+    def __init__(self, system: System, means: Means) -> None:
         self.system = system
         self.means = means
-        self._options = options
         self._emit = system.emit
         self._loop = asyncio.get_running_loop()
         self._inbox: deque[inputs.Input] = deque()
@@ -137,19 +135,14 @@ class Supervisor:
         self.moved = asyncio.Event()
         self.changed = asyncio.Event()
         self.again: set[str] = set()
-        self._begin(system.run)
         self.authority = authority_of(system, means.participant)
-        self._peers = Peers(system, means.participant)
+        if self.authority is not None:
+            system.run.early = configured_before_any_connect(system)
+        self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
-        self.judge = Judge(
-            system,
-            means.participant.graph,
-            looker=self.authority,
-            peers=self._peers,
-        )
         self._processes = Processes(self)
         self._requests = Requests(self)
-        self._looks = Looks(self)
+        self.looks = Looks(self)
         self._ros_interface = RosInterface(self)
         self._server = ControlServer(means.directory.socket_path, self)
         self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
@@ -158,7 +151,7 @@ class Supervisor:
             effects.Spawn: self._processes.spawn,
             effects.Signal: self._processes.signal,
             effects.Sweep: self._processes.sweep,
-            effects.Look: self._looks.look,
+            effects.Look: self.looks.look,
             effects.Program: self._program,
             effects.Answer: self._answer,
             effects.Wake: self._wake_at,
@@ -166,30 +159,6 @@ class Supervisor:
         system.on_change = self._touch
         system.on_health = self._health
         system.liveliness.listen(self._silence)
-
-    def _begin(self, run: core.Run) -> None:
-        """Give the core what the person asked for."""
-        options, timeout_s = self._options, self._options.bring_up_s(len(run.processes))
-        hold_s = options.stop_after_s
-        if hold_s is None and options.until is not Until.ACTIVE:
-            hold_s = 0.0
-        wires = self.system.plan.data_layer.authority is Authority.SUPERVISOR
-        core.begin(
-            run,
-            core.Options(
-                until=core.Level.ACTIVE if options.until is Until.ACTIVE else core.Level.CONNECTED,
-                verifies=options.until is Until.VERIFIED,
-                hold_s=hold_s,
-                timeout_s=timeout_s,
-                gate_s=options.gate_s(timeout_s),
-                strict=options.strict,
-                keep_going=options.keep_going,
-                wires=wires,
-            ),
-        )
-        run.adopting = options.adopt
-        if wires:
-            run.early = configured_before_any_connect(self.system)
 
     # What others ask
 
@@ -202,7 +171,7 @@ class Supervisor:
         return SupervisorSnapshot(
             plan=self.system.expected,
             status=self.status(),
-            observation=self.judge.seen,
+            observation=self.looks.seen,
             verdict=self.system.run.judged.verdict,
         )
 
@@ -223,7 +192,7 @@ class Supervisor:
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
-            check(order, self.system, self._options.machine)
+            check(order, self.system, self.system.run.options.machine)
         except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
         run, change = self.system.run, None
@@ -288,7 +257,7 @@ class Supervisor:
             self._end(run.ending)
             if run.is_over:
                 self._over.set()
-        elif self.system.remote and (left := self._peers.left()) != run.left:
+        elif self.system.remote and (left := self.peers.left()) != run.left:
             self.give(inputs.Saw(left=left))
 
     def _answer(self, effect: effects.Answer) -> None:
@@ -345,7 +314,7 @@ class Supervisor:
     def catch_up(self) -> None:
         """Take every change that has been noticed, and not been taken yet."""
         graph = self.means.participant.graph
-        if self._touched or graph.changes != self._graph_changes or self.judge.is_behind:
+        if self._touched or graph.changes != self._graph_changes or self.looks.is_behind:
             self._touched, self._graph_changes = False, graph.changes
             self.give(inputs.Changed())
             self._wake_looks()
@@ -417,9 +386,9 @@ class Supervisor:
             self.authority.replan(run.plan, again)
             run.early = configured_before_any_connect(self.system)
         self.means.networks.replan(run.plan)
-        self._peers.renew()
+        self.peers.renew()
         if run.first is not first:
-            self._peers.announce()
+            self.peers.announce()
 
     # What is said
 
@@ -486,7 +455,7 @@ class Supervisor:
     async def run(self) -> UpResult:
         """Bring the system up, hold it, and take it down; never leaves anything running."""
         await self._server.open()
-        self._peers.open()
+        self.peers.open()
 
         def changed(event: Event) -> None:
             if not isinstance(event, LogLine):
@@ -500,7 +469,7 @@ class Supervisor:
             asyncio.ensure_future(each)
             for each in (
                 self._follow_graph(),
-                self._looks.follow(),
+                self.looks.follow(),
                 self.answering.follow(),
                 self._watch_fork_server(),
                 self._watch_discovery_server(),
@@ -510,7 +479,7 @@ class Supervisor:
             each.add_done_callback(self._done)
         try:
             with self._signals():
-                if self._options.adopt:
+                if self.system.run.adopting:
                     self.start(self._adopt())
                 self.give(inputs.Tick())
                 try:
@@ -526,7 +495,7 @@ class Supervisor:
             await ended(*beside, *self._tasks)
             if self._wake is not None:
                 self._wake.cancel()
-            self.judge.close()
+            self.looks.close()
             self._ros_interface.close()
             run = result.verdict.run
             self._emit(
@@ -547,7 +516,7 @@ class Supervisor:
             return
         self._last = self.system.run.judged.verdict or NOT_JUDGED
         how = FAILED if ending.failed else ""
-        self._peers.leave(f"{how}{ending.stopping}")
+        self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
@@ -572,7 +541,7 @@ class Supervisor:
     async def leave(self) -> None:
         """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
         self.means.participant.prepare_to_leave()
-        await self._peers.close()
+        await self.peers.close()
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:

@@ -26,6 +26,7 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter, RunStarted
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.verdict import Finding, Verdict
@@ -439,14 +440,20 @@ class World:
     """
 
     def __init__(
-        self, plan: Plan, directory: Path, processes: Iterable[PlannedProcess] | None = None
+        self,
+        plan: Plan,
+        directory: Path,
+        processes: Iterable[PlannedProcess] | None = None,
+        **options: Any,
     ) -> None:
         self.hosts = FakeForkServer()
         self.events: list[SupervisorEvent] = []
         self.emit = Emitter(asyncio.get_running_loop().time)
         self.emit.listen(self.events.append)
         own = plan.processes if processes is None else processes
-        self.system = System(plan, emit=self.emit, logs=directory, processes=own)
+        self.system = System(
+            plan, emit=self.emit, logs=directory, processes=own, options=UpOptions(**options)
+        )
 
     def heard(self, kind: type[T]) -> list[T]:
         """Events of one kind."""

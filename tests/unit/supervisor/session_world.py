@@ -60,7 +60,7 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
-from lifecycle.supervisor.run.options import UpOptions, UpResult
+from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
@@ -455,7 +455,7 @@ class SessionWorld(World):
 
     def __init__(self, plan: Plan, tmp_path: Path, **options: Any) -> None:
         (tmp_path / "logs").mkdir()
-        super().__init__(plan, tmp_path / "logs")
+        super().__init__(plan, tmp_path / "logs", **options)
         self.story = self.hosts.log = _Story()
         self.graph = FakeParticipant(self.hosts)
         self.ending = Ending()
@@ -468,7 +468,6 @@ class SessionWorld(World):
         self.emit.listen(self._take)
         self.journal = Journal("robot", "0", say=self.story.append)
         self.emit.listen(self.journal.on_event)
-        self._options = UpOptions(**options)
         for node in plan.nodes:
             if node.run.kind is RunKind.ATTACH:
                 self.graph.others[node.full_name] = "unconfigured"
@@ -512,7 +511,7 @@ class SessionWorld(World):
                 networks=FakeNetworks(self.hosts),
                 ending=self.ending,
             )
-            session = self.supervisor = Supervisor(self.system, self._options, means)
+            session = self.supervisor = Supervisor(self.system, means)
             self.prepare()
             self.status = session.status
             self.result = await session.run()

@@ -17,8 +17,8 @@ from lifecycle.measure.delays import Delays
 from lifecycle.measure.sample import Measured, Sample
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.peers import Peers
-from lifecycle.supervisor.judging.grace_period import PASSING_S
-from lifecycle.supervisor.judging.judge import HEALTH_S, Judge, without
+from lifecycle.supervisor.shell.grace_period import PASSING_S
+from lifecycle.supervisor.shell.looks import HEALTH_S, Looks, without
 from lifecycle.verify.observation import (
     HealthReport,
     NodeParameters,
@@ -59,15 +59,15 @@ class Judged(SessionWorld):
         self.prepare = self._prepare
 
     def _prepare(self) -> None:
-        judge = self.supervisor.judge
-        really_look = judge.look
+        looks = self.supervisor.looks
+        really_judge = looks.judge
 
-        async def look(stage: Stage) -> Verdict:
-            await really_look(stage)  # which notes what it has seen
+        async def judge(stage: Stage) -> Verdict:
+            await really_judge(stage)  # which notes what it has seen
             self.looks.append(asyncio.get_running_loop().time())
             return self.found(self.looks[-1])
 
-        judge.look = look  # type: ignore[method-assign]
+        looks.judge = judge  # type: ignore[method-assign]
 
 
 async def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
@@ -213,12 +213,18 @@ async def test_what_clocks_decide_is_judged_once_they_were_compared_after_the_la
     air: Any = FakeAir()
     peers = Compared(system, air)
     peers.open()
-    judge = Judge(system, graph, looker=None, peers=peers)
+    shell: Any = SimpleNamespace(
+        system=system,
+        means=SimpleNamespace(participant=SimpleNamespace(graph=graph)),
+        authority=None,
+        peers=peers,
+    )
+    looks = Looks(shell)
     for _ in range(2):  # the second time nothing is new
-        (flow,) = (await judge.look(Stage.ACTIVE)).measured
+        (flow,) = (await looks.judge(Stage.ACTIVE)).measured
         assert [each.outcome for each in flow.bounds] == [outcome]
         assert compared == [apart_ms]
-    judge.close()
+    looks.close()
     await peers.close()
 
 

@@ -17,7 +17,8 @@ from lifecycle.supervisor.control.orders import check
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
 from lifecycle.supervisor.core.orders import FITS, refusal
-from lifecycle.supervisor.core.state import Ending, Options, Order, new_run
+from lifecycle.supervisor.core.state import Ending, Order, new_run
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import Observation
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import World
@@ -33,7 +34,7 @@ PLAN = plan_of(
 @pytest.mark.parametrize("ask", FITS)
 @pytest.mark.parametrize("phase", ["active", "paused", "held", "connecting", "stopping"])
 def test_an_order_fits_some_phases_and_no_others(ask: ControlRequest, phase: str) -> None:
-    run = new_run(PLAN, Options())
+    run = new_run(PLAN, UpOptions())
     run.held_s, run.passage = (None if phase == "connecting" else 0.0), None
     run.paused = phase == "paused"
     run.nodes["camera"].refused = phase == "held"
@@ -49,7 +50,7 @@ def test_an_order_fits_some_phases_and_no_others(ask: ControlRequest, phase: str
 
 def test_a_mode_that_there_is_not_is_refused_with_the_nearest() -> None:
     modes = tuple(Mode(name=each, at=HERE) for each in ("normal", "blind"))
-    run = new_run(replace(PLAN, modes=modes), Options())
+    run = new_run(replace(PLAN, modes=modes), UpOptions())
     run.held_s, run.passage = 0.0, None
     assert refusal(run, Order(id=0, ask=ControlRequest.MODE, mode="blnd")) == (
         "cannot enter mode 'blnd' of 'robot': it has the modes normal, blind; did you mean 'blind'?"
@@ -69,7 +70,7 @@ def test_a_mode_that_there_is_not_is_refused_with_the_nearest() -> None:
     ],
 )
 def test_a_node_that_is_not_ours_is_not_restarted(node: str, message: str) -> None:
-    run = new_run(PLAN, Options())
+    run = new_run(PLAN, UpOptions())
     run.held_s, run.passage = 0.0, None
     assert refusal(run, Order(id=0, ask=ControlRequest.RESTART, node=node)) == message
 

@@ -19,9 +19,7 @@ from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.control.status import system_status
-from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import (
-    Emitter,
     Event,
     Failure,
     GateOpened,
@@ -39,7 +37,7 @@ from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
 from tests.builders import nfe, node, publisher
 from tests.builders import planned as planned_of
-from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.fakes import World, verdict_of
 
 EVENTS: tuple[Event, ...] = (
     ProcessChanged(process="camera", state=ProcessState.RUNNING, pid=7),
@@ -319,7 +317,7 @@ async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_a
     tmp_path: Path,
 ) -> None:
     plan = planned_of(node("camera", publisher("/video"), publisher("/audio")))
-    system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+    system = World(plan, tmp_path).system
     command = system.nodes["camera"]
     command.state = "active"
     hosted = command.planned

@@ -17,8 +17,9 @@ from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.advance import advance, phase_of
 from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.core.state import REACHES, Level, Options, Order, Step, new_run
+from lifecycle.supervisor.core.state import REACHES, Level, Order, Step, new_run
 from lifecycle.supervisor.run.events import Event, Failure
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.core.world import verdict
@@ -54,7 +55,7 @@ class Play:
     """
 
     def __init__(self, plan: Plan, ways: Mapping[str, str] = {}, **options: Any) -> None:
-        self.run = new_run(plan, Options(**options))
+        self.run = new_run(plan, UpOptions(**{"timeout_s": 30.0, **options}))
         self.ways = dict(ways)
         self.asked: list[str] = []
         self.story: list[str] = []

@@ -166,7 +166,9 @@ def test_a_component_is_loaded_once_its_container_is_there() -> None:
 
 def test_no_node_is_wired_before_those_are_configured_that_come_early() -> None:
     hang = {"a configure": "hang", "b configure": "hang"}
-    play = Play(plan_of(planned_node("a"), planned_node("b")), ways=hang, wires=True)
+    plan = plan_of(planned_node("a"), planned_node("b"))
+    negotiated = replace(plan.data_layer, authority=Authority.SUPERVISOR)
+    play = Play(replace(plan, data_layer=negotiated), ways=hang)
     play.run.early = frozenset({"b"})
     assert "a wire" not in play.finish("a configure")
     assert "a wire" in play.finish("b configure")

@@ -307,7 +307,7 @@ def test_an_interrupt_and_what_cuts_a_run_short_that_is_bound_to_stay_are_no_suc
     play = Play(CHAIN)
     play.stop("interrupted", ExitCode.INTERRUPTED)
     assert (play.code, play.reason) == (130, "interrupted")
-    play = Play(CHAIN, hold_s=10.0)
+    play = Play(CHAIN, stop_after_s=10.0)
     play.give(inputs.Stop(reason="terminated", code=ExitCode.TERMINATED))
     why = "terminated; it did not hold for the 10 s of --stop-after"
     assert (play.code, play.reason) == (143, why)

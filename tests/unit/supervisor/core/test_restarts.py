@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core.restart import RestartPolicy, delay_s, is_restarted
-from lifecycle.supervisor.core.state import Options, new_run
+from lifecycle.supervisor.core.state import new_run
 from lifecycle.supervisor.run.events import (
     GateOpened,
     GaveUp,
@@ -17,6 +17,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     VerdictChanged,
 )
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.outcome import Outcome
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.core.playbook import AGAIN, GONE, INTRUDER, Play, chain
@@ -107,7 +108,7 @@ def test_who_goes_down_with_a_process(how: OnFailure, group: str) -> None:
         planned_node("other"),
         replace(part, run=replace(part.run, component="parts/Part", container="helper")),
     )
-    assert " ".join(new_run(plan_of(*nodes), Options()).group("p")) == group
+    assert " ".join(new_run(plan_of(*nodes), UpOptions()).group("p")) == group
 
 
 # Stories

@@ -23,12 +23,13 @@ from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.core.state import Level, Options, new_run
+from lifecycle.supervisor.core.state import Level, new_run
 from lifecycle.supervisor.run.events import (
     Failure,
     SystemReached,
     VerdictChanged,
 )
+from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, GONE, INTRUDER, Play, chain
@@ -65,15 +66,15 @@ def test_a_plain_node_that_will_not_deactivate_is_started_anew_and_has_no_level_
 @pytest.mark.parametrize(
     ("options", "levels", "furthest"),
     [
-        ({"until": Level.CONNECTED, "hold_s": 0.0}, "3 3", "connected"),
-        ({"until": Level.CONNECTED, "verifies": True, "hold_s": 0.0}, "3 3", "verified"),
-        ({"hold_s": 0.0}, "4 4", "active"),
+        ({"until": Until.CONNECTED, "stop_after_s": 0.0}, "3 3", "connected"),
+        ({"until": Until.VERIFIED, "stop_after_s": 0.0}, "3 3", "verified"),
+        ({"stop_after_s": 0.0}, "4 4", "active"),
     ],
 )
 def test_a_system_is_brought_as_far_as_asked(
     options: dict[str, Any], levels: str, furthest: str
 ) -> None:
-    play = Play(CHAIN, **{**options, "hold_s": None})
+    play = Play(CHAIN, **{**options, "stop_after_s": 60.0})
     assert play.levels == levels
     play = Play(CHAIN, **options)
     assert play.run.furthest == furthest
@@ -110,7 +111,7 @@ def test_a_node_that_is_not_as_it_was_verified_is_verified_again() -> None:
 
 
 def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
-    run = new_run(CHAIN, Options(timeout_s=2.0))
+    run = new_run(CHAIN, UpOptions(timeout_s=2.0))
     take(run, 0.0, inputs.Tick())
     take(run, 9.0, inputs.Tick())
     assert run.failures[0].message.endswith("within 2 s: nothing was started")
@@ -143,7 +144,7 @@ def test_a_node_of_others_is_configured_and_left_as_it_was_found() -> None:
 def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     plan = plan_of(planned_node("far"), planned_node("near", after={"far": Condition.CONFIGURED}))
     play = Play(plan)
-    play.run = new_run(plan, Options(), own=frozenset({"near"}))
+    play.run = new_run(plan, UpOptions(), own=frozenset({"near"}))
     play.give(inputs.Tick())
     assert play.levels == "1"
     play.give(inputs.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
@@ -153,7 +154,7 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
 def test_what_ran_before_is_attached_to_before_anything_is_begun() -> None:
     plan = plan_of(planned_node("camera"), planned_node("viewer"), planned_node("far"))
     play = Play(plan)
-    play.run = new_run(plan, Options(), own=frozenset({"camera", "viewer"}))
+    play.run = new_run(plan, UpOptions(), own=frozenset({"camera", "viewer"}))
     play.run.adopting = True
     assert play.give(inputs.Tick()) == []
     attached, names = attached_to(plan, {"viewer"}), frozenset({"/viewer"})
@@ -187,7 +188,7 @@ def test_the_deadline_names_what_is_waited_for_and_where_that_is_written() -> No
 
 
 def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
-    play = Play(CHAIN, hold_s=5.0)
+    play = Play(CHAIN, stop_after_s=5.0)
     play.see(GONE)
     play.give(inputs.Saw(left=frozenset({"/camera"})))
     play.wait(6.0)
@@ -208,7 +209,7 @@ def test_a_death_ends_the_run_unless_it_is_to_keep_going() -> None:
     play = Play(CHAIN)
     play.die("camera")
     assert (play.code, play.reason) == (6, "failed: /camera (run.process-died)")
-    play = Play(CHAIN, keep_going=True, hold_s=10.0)
+    play = Play(CHAIN, keep_going=True, stop_after_s=10.0)
     play.die("camera")
     assert play.levels == "0 4"
     play.wait(10.0)
@@ -245,7 +246,7 @@ def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
     ],
 )
 def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, why: str) -> None:
-    play = Play(CHAIN, hold_s=10.0)
+    play = Play(CHAIN, stop_after_s=10.0)
     play.see(INTRUDER)
     play.wait(lasts_s)
     play.see()
@@ -262,7 +263,9 @@ def test_who_needs_a_node_that_is_kept_inactive_is_kept_inactive_too() -> None:
 
 
 def test_a_violation_that_lasted_counts_also_where_nothing_is_to_be_activated() -> None:
-    play = Play(plan_of(planned_node("driver", managed=False, kind=RunKind.COMMAND)), hold_s=10.0)
+    play = Play(
+        plan_of(planned_node("driver", managed=False, kind=RunKind.COMMAND)), stop_after_s=10.0
+    )
     play.see(INTRUDER)
     play.wait(2.0)
     play.see()
@@ -337,7 +340,7 @@ def test_a_gate_stays_closed_for_good_only_by_a_verdict_of_what_is_there_now() -
 def test_an_endpoint_of_nobody_counts_only_where_no_process_is_coming_up(
     restarts: bool, code: int
 ) -> None:
-    play = Play(chain(), hold_s=10.0)
+    play = Play(chain(), stop_after_s=10.0)
     if restarts:
         play.ways["viewer configure"] = "hang"
         play.die("viewer")
@@ -495,7 +498,7 @@ def test_what_is_found_beside_all_looks_ends_the_run_and_is_said() -> None:
 
 
 def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code() -> None:
-    play = Play(CHAIN, ways={"viewer deactivate": "hang"}, hold_s=9.0)
+    play = Play(CHAIN, ways={"viewer deactivate": "hang"}, stop_after_s=9.0)
     play.order(ControlRequest.RESTART, node="/viewer")
     play.see(INTRUDER)
     play.wait(1.5)

@@ -35,6 +35,7 @@ from lifecycle.measure.bounds import Kind
 from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
+from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Verdict
 from tests.builders import HERE, plan_of, planned_endpoint, planned_node
@@ -192,12 +193,12 @@ class World:
         self.faults = r.randint(0, 10)
         self.broke_s = 0.0
         self.stubborn = {each.name for each in self.plan.processes if r.random() < 0.2}
-        connected = core.state.Level.CONNECTED
-        until = r.choice([*6 * [core.state.Level.ACTIVE], connected])
-        options = core.state.Options(
+        until = r.choice([*6 * [Until.ACTIVE], Until.CONNECTED])
+        if until is Until.CONNECTED and r.random() < 0.5:
+            until = Until.VERIFIED
+        options = UpOptions(
             until=until,
-            verifies=until is connected and r.random() < 0.5,
-            hold_s=r.choice([None, 5.0]),
+            stop_after_s=r.choice([None, 5.0]),
             timeout_s=30.0,
             keep_going=r.random() < 0.2,
             strict=r.random() < 0.2,
@@ -567,7 +568,11 @@ class World:
             level = self.level_of[node.key]
             kept = self.run.paused or node.withheld or node.refused or self.needs_kept(node)
             kept = kept or any(map(self.is_gone, self.run.nodes.values()))  # which is violated
-            kept = kept or self.run.options.until < 4 or node.planned.state is TargetState.INACTIVE
+            kept = (
+                kept
+                or self.run.options.until is not Until.ACTIVE
+                or node.planned.state is TargetState.INACTIVE
+            )
             gate = 3 if node.planned.managed else 1
             least = gate if kept or not node.planned.holds else 4
             assert level >= least, f"up: {node.key} stays at {level} {self}"
@@ -621,7 +626,7 @@ class World:
         missing = self.orders.keys() - self.answers.keys()
         assert not missing, f"answers: orders {missing} were never answered"
         code = self.core.failure.exit_code_of(self.run)
-        judged = self.run.options.until >= 4 or self.run.options.verifies
+        judged = self.run.options.until is not Until.CONNECTED
         done = judged and self.run.ending.stopping == "done"
         assert not (self.lasted and done and code is ExitCode.OK), (
             "violations: one that lasted is not in the exit code"

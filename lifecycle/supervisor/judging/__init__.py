@@ -1,1 +1,0 @@
-"""Looks at the running system, and judges what is there by the manifest."""
