@@ -17,10 +17,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
+from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import PROCESS_VARIABLE, groups_of
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
+    SERVES,
     ChildReport,
     ForkRequest,
 )
@@ -42,6 +44,9 @@ _LEFT_S = 0.5
 
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
+
+_READY_S = 10.0
+"""A fork server serves after 0.2 s; a loaded machine takes longer."""
 
 _HOST = "lifecycle.node.host.host"
 
@@ -86,11 +91,13 @@ class ForkServerChild:
         if self.exited.done():
             return
         self._loop.remove_reader(self._pidfd)
-        ours = 0
+        found = None
         with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
-            ours, status = os.waitpid(self.pid, os.WNOHANG)
-        if ours:
-            self.settle(ProcessExit.from_wait(status))
+            found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
+        if found is not None:
+            is_exit = found.si_code == os.CLD_EXITED
+            kind = {"status" if is_exit else "signal": found.si_status}
+            self.settle(ProcessExit(**kind))
         elif patience_s > 0:
             self._loop.call_later(patience_s, self._ended, 0.0)
         else:
@@ -124,6 +131,7 @@ class ForkServer:
         self._foreign = Lineage().children(os.getpid())
         self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
+        self._serves = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
         process.socket.setblocking(False)
         self._loop.add_reader(process.socket, self._reports)
@@ -146,6 +154,19 @@ class ForkServer:
             # What it had adopted, and what it had started, is ours now.
             roots |= lineage.children(os.getpid()) - self._foreign
         return frozenset().union(*map(lineage.of, roots)) - {self.pid}
+
+    async def ready(self) -> None:
+        """Have the fork server answer, bounded.
+
+        Raises:
+            BringUpError: it does not, or has died.
+        """
+        self._serves.clear()
+        self._ask(SERVES.encode())
+        if not await set_within(self._serves, _READY_S):
+            raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
+        if self.died.done():
+            raise BringUpError(self.died.result())
 
     def _ask(self, message: bytes, descriptors: Sequence[int] = ()) -> None:
         """Send a message; raises BringUpError if it has died, or cannot be asked."""
@@ -264,7 +285,9 @@ class ForkServer:
 
     def _take(self, report: ChildReport, descriptors: list[int]) -> None:
         child = self._children.get(report.id)
-        if report.id in self._pending:
+        if report.id == 0:
+            self._serves.set()
+        elif report.id in self._pending:
             self._born(report, descriptors)
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
@@ -294,6 +317,7 @@ class ForkServer:
         self._reports()
         exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
+        self._serves.set()
         for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))

@@ -33,6 +33,7 @@ from lifecycle.middleware.process.prctl import (
     drop_network_administration,
     refuse_new_privileges,
 )
+from lifecycle.supervisor.processes.fork_server_process import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
@@ -71,7 +72,7 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:
-        id: of the ForkRequest.
+        id: of the ForkRequest; 0 answers SERVES.
         pid: of the child; 0 if it could not be forked.
         status: waitpid(2) status; None while it runs.
         error: why it could not be forked.
@@ -84,6 +85,9 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
     stopped: bool | None = None
 
+
+SERVES = "serves"
+"""A message: say that you serve."""
 
 _CHANGES = os.WNOHANG | os.WUNTRACED | os.WCONTINUED
 _WAKEUP_BYTES = 4096
@@ -125,8 +129,12 @@ class _ForkServer:
             return False
         if data.startswith(b"{"):
             self._fork(from_json(data, ForkRequest), descriptors)
-        else:
-            _preload(data.decode().split("\n"))
+            return True
+        word, *lines = data.decode().split("\n")
+        if word == SERVES:
+            self._tell(ChildReport(id=0))
+        elif word == PRELOAD:
+            _preload(lines)
         return True
 
     def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:

@@ -16,6 +16,9 @@ from collections.abc import Collection
 from lifecycle.errors import BringUpError
 from lifecycle.run_directory import RUN_VARIABLE, new_run_id
 
+PRELOAD = "preload"
+"""Begins a message that names interface types, one a line; requests to fork are JSON."""
+
 CLOSE_S = 1.0
 """A fork server whose children have ended ends within milliseconds of its socket."""
 
@@ -68,7 +71,7 @@ class ForkServerProcess:
         if self._preloads and types:
             # One that has died is noticed by what asks it to fork.
             with contextlib.suppress(OSError):
-                self.socket.send("\n".join(types).encode())  # requests to fork are JSON
+                self.socket.send("\n".join((PRELOAD, *types)).encode())
 
     def close(self) -> None:
         """End it: it ends once its socket is closed and no child is left. Again is harmless."""

@@ -464,6 +464,19 @@ async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_
     assert world.graph.dropped == ["/viewer"]
 
 
+async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    why = "the fork server does not answer within 10 s"
+    async with world.running("[system] active"):
+        world.hosts.cannot_start = why
+        assert await world.order(ControlRequest.RESTART) == (
+            f"6 cannot restart 'robot': {why}; everything stays as it is"
+        )
+        assert await world.order(ControlRequest.DOWN) == "0"
+    ends = ["[stopping] at 0.0 s: lifecycle down", *DOWN, *over(0)]
+    assert world.since("[system] active")[1:] == ends
+
+
 # Signals
 
 

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
+    Authority,
     EndpointKind,
     OnFailure,
     Quantity,
