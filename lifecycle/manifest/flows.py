@@ -21,6 +21,7 @@ from lifecycle.manifest.model import (
     Node,
 )
 from lifecycle.manifest.names import topic_of
+from lifecycle.network.dscp import DIRECT, MappedPriority, map_priority
 from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
 from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
@@ -113,6 +114,7 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         topic: fully qualified name; empty if it cannot be resolved.
         unique: it must get an NFE of its own.
         flow_class: 5QI; publishers only.
+        priority: what becomes of its 'transport_priority'; None without.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
@@ -123,6 +125,7 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     topic: str
     unique: bool
     flow_class: FlowClass
+    priority: MappedPriority | None = None
     max_delay_ms: float | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
@@ -130,7 +133,9 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def dscp(self) -> int | None:
         """The DSCP of its data, of a subscription of what it acknowledges with, 0–63."""
-        return self.need.dscp
+        if self.need.dscp is not None or self.priority is None:
+            return self.need.dscp
+        return self.priority.dscp
 
     @property
     def five_qi(self) -> int | None:
@@ -248,10 +253,17 @@ class FlowNeeds:
             topic=topic,
             unique=need.unique.asks,
             flow_class=flow_class,
+            priority=self._priority(need),
             max_delay_ms=delay,
             transports=self._transports(node) if self._by_participant(need) else (),
         )
         return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(node, resolved))
+
+    def _priority(self, need: FlowNeed) -> MappedPriority | None:
+        if need.transport_priority is None:
+            return None
+        mapping = self._manifest.network.transport_priority_mapping
+        return map_priority(need.transport_priority, mapping or DIRECT)
 
     def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
         if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:

@@ -18,6 +18,7 @@ from lifecycle.codec import says
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.medium import FlowTransport as FlowTransport  # noqa: PLC0414
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -231,6 +232,7 @@ Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
 Hertz = Annotated[float, Meta(gt=0, le=1_000_000)]
+UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 """A ROS parameter value; arrays are tuples of one scalar type."""
@@ -667,6 +669,9 @@ class SubscriptionFlow(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_f
         dscp: Differentiated services code point of everything it sends, which is its
             acknowledgements: the data carry the publisher's. A name (RFC 2474, 2597, 3246, …) or 0
             to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY of the DataReader, instead of 'dscp': goes
+            through 'network.transport_priority_mapping' to become a TOS byte, which is four times
+            the DSCP. Without a mapping it is the TOS byte.
         enforce: Whether a DSCP that could not be applied is violated (true) or a warning (false).
         transport: What carries it: what the planner chooses (any), an IP socket (network), shared
             memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
@@ -676,6 +681,7 @@ class SubscriptionFlow(MeasuredKeys, frozen=True, kw_only=True, forbid_unknown_f
 
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
     dscp: Dscp | None = None
+    transport_priority: Annotated[UInt32, Meta(examples=[184])] | None = None
     enforce: bool = True
     transport: FlowTransport = FlowTransport.ANY
     lossy: bool | None = None
@@ -687,6 +693,9 @@ class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
     Attributes:
         dscp: Differentiated services code point of everything it sends: a name (RFC 2474, 2597,
             3246, …) or 0 to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY, instead of 'dscp': goes through
+            'network.transport_priority_mapping' to become a TOS byte, which is four times the DSCP.
+            Without a mapping it is the TOS byte.
         five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
             'max_delay_ms', 'loss' and 'rate_hz' and says why.
         max_delay_ms: Longest delay from publication to the start of the callback, milliseconds;
@@ -707,7 +716,8 @@ class FlowNeed(PublisherFlow, frozen=True, kw_only=True):
     Attributes:
         kind: PUBLISHER or SUBSCRIPTION.
         name: the endpoint's declared name.
-        dscp: 0–63, of all that the endpoint sends; None leaves it alone.
+        dscp: 0–63, of all that the endpoint sends; None leaves it alone. Never beside
+            `transport_priority`.
         five_qi: None if not asked for, or left to us.
         five_qi_auto: `five_qi: auto`: the planner proposes one.
         rate_hz: messages per second that a network must carry: the upper bound where it has one.
@@ -914,6 +924,7 @@ class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             with IPv4 if left out.
     """
 
+    transport_priority_mapping: TransportPriorityMapping | None = None
     max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
 
 

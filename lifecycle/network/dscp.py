@@ -1,6 +1,8 @@
-"""DSCP (differentiated services code point): names, numbers, TOS byte.
+"""DSCP (differentiated services code point): names, numbers, TOS byte, TRANSPORT_PRIORITY mapping.
 
-Owns: every spelling of a DSCP that a user may write or read. Pure.
+Owns: every spelling of a DSCP that a user may write or read; TRANSPORT_PRIORITY → TOS byte as RTI
+Connext Micro computes it (*Connext Micro, Transport Priority*, "Using transport priority with
+UDP"), for systems that number so, and what that mapping silently loses. Pure.
 
 A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
 two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both
@@ -11,10 +13,11 @@ from __future__ import annotations
 
 import functools
 import re
+from typing import Annotated
 
 import msgspec
 
-from lifecycle.codec import read_table
+from lifecycle.codec import Octet, read_table, says
 
 MAX_DSCP = 63
 """Six bits."""
@@ -127,3 +130,75 @@ def describe(dscp: int) -> str:
     name = dscp_name(dscp)
     prefix = "" if name.isdecimal() else f"{name} = "
     return f"{prefix}DSCP {dscp} = TOS {tos(dscp)} (0x{tos(dscp):02x})"
+
+
+_BITS_32 = 0xFFFFFFFF
+
+
+class TransportPriorityMapping(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
+    """How a 'transport_priority' becomes a TOS byte, as RTI Connext Micro computes it.
+
+    These are UDPInterfaceFactoryProperty's three transport priority fields.
+
+    Attributes:
+        mask: Bits of the priority that take part; 0xFF with the defaults of 'low' and 'high' takes
+            the priority as the TOS byte, 0 sets nothing.
+        low: TOS byte of the lowest priority.
+        high: TOS byte of the highest priority, not below 'low'.
+    """
+
+    mask: Annotated[int, says(minimum=0, maximum=0xFFFFFFFF)]
+    low: Octet = 0
+    high: Octet = 0xFF
+
+
+DIRECT = TransportPriorityMapping(mask=0xFF)
+"""Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
+
+
+class MappedPriority(msgspec.Struct, frozen=True, kw_only=True):
+    """What becomes of one TRANSPORT_PRIORITY value.
+
+    Attributes:
+        tos: 0–255; None if the mask is 0 and the TOS byte is not set.
+        ignored_bits: bits of the priority that made no difference: outside the mask or shifted out.
+    """
+
+    tos: int | None
+    ignored_bits: int
+
+    @property
+    def dscp(self) -> int | None:
+        """0–63; None if nothing is set, or ECN bits would be."""
+        return None if self.tos is None or self.sets_ecn else self.tos >> 2
+
+    @property
+    def sets_ecn(self) -> bool:
+        """Whether the result would write the two ECN bits, which belong to the transport."""
+        return self.tos is not None and bool(self.tos & ECN_MASK)
+
+
+def map_priority(priority: int, mapping: TransportPriorityMapping) -> MappedPriority:
+    """Return the TOS byte for a TRANSPORT_PRIORITY value, in integer arithmetic.
+
+    Let n be the number of 4-bit right shifts until `mask & 0xffff0000` is 0. Then
+    `TOS = ((priority & mask) >> 4n) * (high - low) / (mask >> 4n) + low`.
+
+    Args:
+        priority: the QoS value, a signed 32-bit `long` in DDS; its bits count.
+        mapping: the transport's three fields.
+
+    """
+    bits = priority & _BITS_32
+    if mapping.mask == 0:
+        return MappedPriority(tos=None, ignored_bits=bits)
+    shift = 0
+    while (mapping.mask >> shift) & 0xFFFF0000:
+        shift += 4
+    masked, mask = (bits & mapping.mask) >> shift, mapping.mask >> shift
+    return MappedPriority(
+        tos=masked * (mapping.high - mapping.low) // mask + mapping.low,
+        ignored_bits=bits & ~(masked << shift),
+    )

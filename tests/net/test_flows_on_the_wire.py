@@ -32,7 +32,8 @@ _MARKED: Mapping[str, Any] = {
             "battery": {},
         }
     },
-    "nodes/n2/flows": {"subscriptions": {"battery": {"dscp": "CS6"}}},
+    # A DataReader's TRANSPORT_PRIORITY, as-is: TOS 0xC0 is CS6.
+    "nodes/n2/flows": {"subscriptions": {"battery": {"transport_priority": 0xC0}}},
 }
 _TWO_MARKS: Mapping[str, Any] = {
     "nodes/n1/flows": {"publishers": {"video": {"dscp": "EF"}, "battery": {"dscp": "AF41"}}},

@@ -19,6 +19,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.yaml.document import error, note, warning
+from lifecycle.network.dscp import MappedPriority, describe
 from lifecycle.network.nfe import UniqueRequirement
 
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -27,6 +28,11 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 
 def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for transports."""
+    mapping = system.manifest.network.transport_priority_mapping
+    at = system.manifest.positions.get("network.transport_priority_mapping")
+    if mapping is not None and at is not None and mapping.low > mapping.high:
+        message = f"cannot map priorities to TOS {mapping.low:#x} … {mapping.high:#x}"
+        yield error("check.flow-dscp", at, message, "the highest is below the lowest: swap them")
     for node in system.manifest.nodes:
         for each in system.needs.of_node(node):
             yield from _endpoint(node, each.need)
@@ -60,14 +66,45 @@ def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
 
 def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     need = each.need
-    marks = need.dscp is not None and need.kind is EndpointKind.SUBSCRIPTION
-    if marks and _is_best_effort(node, need):
+    given = need.dscp is not None or need.transport_priority is not None
+    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
         message = (
             f"cannot mark anything that subscription {need.name!r} sends with a DSCP: it is "
             f"BEST_EFFORT and acknowledges nothing"
         )
         hint = "make it RELIABLE, or mark the publishers of the topic"
         yield note("check.flow-dscp", need.at, message, hint)
+    if each.priority is not None:
+        yield from _priority(need, each.priority)
+
+
+def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
+    """Say what a 'transport_priority' cannot be, and which of its bits get lost."""
+    number = need.transport_priority or 0
+    priority = f"transport_priority {number} ({number:#x})"
+    if need.dscp is not None:
+        message = (
+            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
+            f"the whole mark"
+        )
+        hint = f"keep one; the one is {describe(need.dscp)}, the other {priority}"
+        yield error("check.flow-dscp", need.at, message, hint)
+    elif mapped.tos is None:
+        message = f"cannot mark anything with {priority}: the mask is 0"
+        yield note("check.transport-priority", need.at, message, "")
+    elif mapped.sets_ecn:
+        message = (
+            f"cannot use {priority}: it is TOS {mapped.tos} ({mapped.tos:#04x}), whose two lowest "
+            f"bits are ECN and belong to the transport (RFC 3168)"
+        )
+        hint = f"without them it is {describe(mapped.tos >> 2)}"
+        yield error("check.flow-dscp", need.at, message, hint)
+    elif mapped.ignored_bits:
+        message = (
+            f"cannot map bits {mapped.ignored_bits:#x} of {priority}: the mask leaves them out"
+        )
+        hint = f"what is left is {describe(mapped.tos >> 2)}"
+        yield note("check.transport-priority", need.at, message, hint)
 
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:

@@ -70,6 +70,10 @@ def test_the_smaller_datagram_serves_all_of_a_class():
     assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
 
 
+def test_a_priority_and_a_dscp_that_come_to_the_same_share():
+    assert carried(need(PUB, "a", dscp=46), need(PUB, "b", transport_priority=184)) == [("a", "b")]
+
+
 def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
     only = node(
         "n",
