@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.middleware.process.busy_sign import Overdue
 from lifecycle.supervisor.run.events import (
@@ -27,7 +28,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.run import NOT_ANSWERING, SILENT_NODE
 from lifecycle.verify.tool_filter import is_hidden_node, tolerating_pattern
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.process import ManagedProcess
@@ -46,6 +47,7 @@ class Cause(enum.Enum):
 class _Silence(msgspec.Struct):
     since_s: float
     causes: dict[Cause, str]
+    hangs_since_s: float = 0.0
 
 
 class SilenceMonitor:
@@ -87,13 +89,16 @@ class SilenceMonitor:
         silence = self._silent.get(node)
         return silence is not None and bool({Cause.STOPPED, Cause.LOST} & silence.causes.keys())
 
-    def fell_silent(self, nodes: Iterable[str], cause: Cause, detail: str) -> None:
+    def fell_silent(
+        self, nodes: Iterable[str], cause: Cause, detail: str, *, busy_s: float = 0.0
+    ) -> None:
         """Note that nodes are silent.
 
         Args:
             nodes: their names.
             cause: why.
             detail: half a sentence.
+            busy_s: seconds for which a callback of theirs has been running.
         """
         news = False
         for name in nodes:
@@ -105,6 +110,10 @@ class SilenceMonitor:
             elif cause not in silence.causes:
                 silence.causes[cause] = detail
                 news = True
+            else:
+                continue
+            if cause is Cause.HUNG:
+                silence.hangs_since_s = self._emit.elapsed_s - busy_s
         if news:
             self._tell()
 
@@ -171,13 +180,14 @@ class SilenceMonitor:
                 assert process.channel is not None
                 assert process.channel.sign is not None
                 sign = process.channel.sign
+                limit_s, busy_s = sign.limit_s, sign.busy_s
                 what = f" {sign.what}" if sign.what else ""
                 at = process.where()
                 detail = (
-                    f"a callback{what} in {where} has been running for more than {sign.limit_s:g} s"
+                    f"a callback{what} in {where} has been running for more than {limit_s:g} s"
                     f"{at and f', in {at}'}"
                 )
-                self.fell_silent(names, Cause.HUNG, detail)
+                self.fell_silent(names, Cause.HUNG, detail, busy_s=busy_s)
             elif why is Overdue.UNSERVED:
                 detail = f"{where} gets no processor for its callback: the machine is overloaded"
                 self.fell_silent(names, Cause.UNSERVED, detail)
@@ -213,6 +223,18 @@ class SilenceMonitor:
         ) + tuple(
             found for name, found in sorted(self._unanswering.items()) if name not in self._silent
         )
+
+    def by_now(self, verdict: Verdict) -> Verdict:
+        """Return a verdict that says for how long nodes have hung by now."""
+        found = []
+        for each in verdict.findings:
+            silence = self._silent.get(each.subject)
+            if each.rule == SILENT_NODE.id and silence and Cause.HUNG in silence.causes:
+                busy_s = self._emit.elapsed_s - silence.hangs_since_s
+                message = f"{_message(each.subject, _why(silence))}; {busy_s:.1f} s by now"
+                each = replace(each, message=message)  # noqa: PLW2901
+            found.append(each)
+        return replace(verdict, findings=tuple(found))
 
 
 def arrivals(before: Collection[str], observation: Observation, emit: Emitter) -> frozenset[str]:

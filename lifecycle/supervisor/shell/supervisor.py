@@ -521,7 +521,8 @@ class Supervisor:
         """Begin to leave, once."""
         if self._last is not None:
             return
-        self._last = self.system.run.judged.verdict or NOT_JUDGED
+        latest = self.system.run.judged.verdict
+        self._last = NOT_JUDGED if latest is None else self.system.liveliness.by_now(latest)
         how = FAILED if ending.failed else ""
         self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup
 from lifecycle.manifest.loading import load
@@ -15,6 +16,7 @@ from lifecycle.manifest.model import (
     Machine,
     Network,
 )
+from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
 from tests.builders import at, link, manifest, need, node, publisher, subscription
@@ -68,6 +70,26 @@ def test_the_smaller_datagram_serves_all_of_a_class():
         need(PUB, "large", dscp=46, max_message_size=60_000),
     )
     assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
+
+
+@pytest.mark.parametrize(
+    ("priority", "mapping", "dscp"),
+    [
+        (184, None, 46),  # without a mapping, the priority is the TOS byte
+        (0xB8, TransportPriorityMapping(mask=0xFF), 46),
+        (0, TransportPriorityMapping(mask=0x03, high=0x03), 0),
+        (3, TransportPriorityMapping(mask=0x03, high=0xFC), 63),
+        (184, TransportPriorityMapping(mask=0), None),
+        (185, None, None),  # ECN bits
+    ],
+)
+def test_a_transport_priority_becomes_a_dscp(
+    priority: int, mapping: TransportPriorityMapping | None, dscp: int | None
+):
+    marked = node("n", publisher("a"), needs=[need(PUB, "a", transport_priority=priority)])
+    made = replace(manifest(marked), network=Network(transport_priority_mapping=mapping))
+    (found,) = FlowNeeds(made).of_node(marked)
+    assert found.dscp == dscp
 
 
 def test_a_priority_and_a_dscp_that_come_to_the_same_share():
@@ -196,7 +218,7 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     network = system.network
     assert network.max_datagram_bytes == 1300
     video, pose, alarm, log = system.nodes[0].flows
-    assert (video.unique, video.dscp, video.enforce) == (STRICTLY, 46, False)
+    assert (video.unique, video.transport_priority, video.enforce) == (STRICTLY, 184, False)
     assert (video.max_message_size, video.transport, video.non_blocking_send) == (
         60000,
         NETWORK,

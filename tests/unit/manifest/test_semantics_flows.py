@@ -84,10 +84,10 @@ def test_a_link_demands_what_its_ends_must_ask_for(
 MARKED = FlowNeed(kind=EndpointKind.PUBLISHER, name="", dscp=0, at=at(1))
 
 
-def acknowledging(reliability: Reliability) -> Manifest:
+def acknowledging(reliability: Reliability, **changes: object) -> Manifest:
     """A stream whose subscription is marked."""
     source = node("n0", publisher("s0", EMPTY), needs=[replace(MARKED, name="s0")])
-    need = replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", dscp=48)
+    need = replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", dscp=48, **changes)
     endpoint = subscription("s0", EMPTY, qos=replace(QosProfile(), reliability=reliability))
     sink = node("sink", endpoint, needs=[need])
     links = [link("/s0", "n0", "sink", unique=UniqueHow.WEAKLY)]
