@@ -260,6 +260,7 @@ def _shows(name: str, manifest: str, place: Place, runtime: Path) -> None:
         "capture": ("--domain", str(place.domain), "--wait", "1"),
         "graph": (manifest,),
         "status": (manifest,),
+        BLIND: (manifest, "--timeout", "4"),  # all have joined by then, whatever else runs
     }.get(name, (manifest, "--timeout", "1"))
     code, shown = VERBS.get(name, (ExitCode.VIOLATED, "\\x"))
     done = verb(name.removesuffix(" blindly"), *words, runtime=runtime)

@@ -94,6 +94,12 @@ class OwnLiveliness:
             timer.start()
 
 
+def report(line: str) -> None:
+    """Print a line if it is still read: a closed pipe does not end a node."""
+    with contextlib.suppress(BrokenPipeError):
+        print(line, flush=True)
+
+
 def run(
     node_class: Callable[..., Any],
     *,
@@ -101,6 +107,7 @@ def run(
     spec: PlannedNode | None = None,
     domain_id: int | None = None,
     arguments: list[str] | None = None,
+    say: Callable[[str], None] = report,
     interrupted: ExitCode = ExitCode.OK,
 ) -> NoReturn:
     """Run a node until Ctrl-C or SIGTERM, shut it down, and end the process; never returns.
@@ -117,6 +124,7 @@ def run(
         spec: the node's part of a plan; None for a node that declares its endpoints in code.
         domain_id: 0–232; None takes ROS_DOMAIN_ID, else 0.
         arguments: command line with --ros-args; None takes the process's own.
+        say: called with each step; it prints to standard output.
         interrupted: exit code after Ctrl-C; OK as for other ROS nodes, since launch calls a node
             that exits otherwise died.
 
@@ -144,7 +152,7 @@ def run(
     )
 
     def end(number: signal.Signals) -> None:
-        report(f"{number.name}: shutting down")
+        say(f"{number.name}: shutting down")
         loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
 
     with on_signal(end, {}):
@@ -158,27 +166,27 @@ def run(
         loop.add(hosted)
         if isinstance(hosted, Managed):
             liveliness.open(hosted, loop.republish_names)
-        hosted.listeners.append(lambda _: report(f"{name}: {_state(hosted)}"))
-        report(f"{name}: {_state(hosted)}")
+        hosted.listeners.append(lambda _: say(f"{name}: {_state(hosted)}"))
+        say(f"{name}: {_state(hosted)}")
         if lifecycle is None:
             auto = isinstance(hosted, Managed) and hosted.auto
         if auto and hosted.spec.managed:
-            loop.call_soon(_bring_up, hosted, loop)
+            loop.call_soon(_bring_up, hosted, loop, say)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")
 
 
-async def _bring_up(hosted: Hosted, loop: NodeLoop) -> None:
+async def _bring_up(hosted: Hosted, loop: NodeLoop, say: Callable[[str], None]) -> None:
     name = hosted.full_name
     try:
         result = await hosted.bring_up()
     except Exception as error:  # noqa: BLE001 - shown, then the process ends
         traceback.print_exc()
-        report(f"cannot bring up {name}: {error}")
+        say(f"cannot bring up {name}: {error}")
     else:
         if result.outcome is CallbackOutcome.SUCCESS:
             return
-        report(f"cannot bring up {name}: {result.error}")
+        say(f"cannot bring up {name}: {result.error}")
     loop.stop("a failed bring-up", code=ExitCode.BRING_UP_FAILED)
 
 
@@ -186,9 +194,3 @@ def _state(hosted: Hosted) -> str:
     if isinstance(hosted, Managed):
         return hosted.state.value
     return hosted.reported.label or "running"
-
-
-def report(line: str) -> None:
-    """Print a line if it is still read: a closed pipe does not end a node."""
-    with contextlib.suppress(BrokenPipeError):
-        print(line, flush=True)
