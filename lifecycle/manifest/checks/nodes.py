@@ -340,7 +340,13 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
     at = system.manifest.where("discovery", start)
-    if max_participants(domain, LINUX).participants == 0:
+    try:
+        room = max_participants(domain, LINUX).participants
+    except ValueError as problem:  # of a manifest that was made by code
+        message, _, hint = str(problem).partition("; ")
+        yield error("check.domain", at, message, hint)
+        return
+    if room == 0:
         domains = describe_domains(safe_domains(LINUX))
         message = (
             f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
