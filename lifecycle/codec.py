@@ -32,6 +32,7 @@ DomainId = Annotated[int, msgspec.Meta(ge=0, le=232)]
 DscpValue = Annotated[int, msgspec.Meta(ge=0, le=63)]
 FlowLabel = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFF)]
 Octet = Annotated[int, msgspec.Meta(ge=0, le=0xFF)]
+UInt32 = Annotated[int, msgspec.Meta(ge=0, le=0xFFFFFFFF)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 PortOrNone = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 

@@ -468,7 +468,8 @@ def find_run(roots: Iterable[Path], word: str) -> Path:
 
     Args:
         roots: see run_roots.
-        word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there.
+        word: a run's name, `teleop@7`, or its system, `teleop`, where only one such run is there;
+            else its directory.
 
     Raises:
         UsageError: no such run, or more than one.
@@ -493,7 +494,7 @@ def find_run(roots: Iterable[Path], word: str) -> Path:
 
 
 def _is_named(path: Path, word: str) -> bool:
-    return word in (path.name, path.name.rpartition("@")[0])
+    return word in (path.name, path.name.rpartition("@")[0], str(path))
 
 
 @contextlib.contextmanager

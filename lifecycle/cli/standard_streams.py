@@ -234,7 +234,7 @@ class Writer:
         self._say = say
         self._encoding = encoding
         self._changed = threading.Condition()
-        # Each with the number of lines that are lost with it: a note stands for those it is about.
+        # Each with the number of lines that are lost with it; of a note, of those that it counts.
         self._queue: collections.deque[tuple[bytes, int]] = collections.deque()
         self._bytes = 0
         self._lost = 0

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from lifecycle.codec import Octet
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
@@ -131,7 +132,7 @@ _TYPES: Mapping[str, Any] = {
     "int_array": tuple[int, ...],
     "double_array": tuple[float, ...],
     "string_array": tuple[str, ...],
-    "byte_array": tuple[written.Octet, ...],
+    "byte_array": tuple[Octet, ...],
 }
 
 

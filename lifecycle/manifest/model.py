@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from lifecycle.codec import says
+from lifecycle.codec import UInt32, says
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
@@ -232,7 +232,6 @@ Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
 Hertz = Annotated[float, Meta(gt=0, le=1_000_000)]
-UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 """A ROS parameter value; arrays are tuples of one scalar type."""

@@ -52,7 +52,6 @@ Prefix = Annotated[
     str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
 ]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Octet = Annotated[int, Meta(ge=0, le=255)]
 
 Scalar = str | int | float | bool
 """A value that is one word: where its text counts, whatever scalar it is."""

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import functools
 import re
-from typing import Annotated
 
 import msgspec
 
-from lifecycle.codec import Octet, read_table, says
+from lifecycle.codec import Octet, UInt32, read_table
 
 MAX_DSCP = 63
 """Six bits."""
@@ -149,7 +148,7 @@ class TransportPriorityMapping(
         high: TOS byte of the highest priority, not below 'low'.
     """
 
-    mask: Annotated[int, says(minimum=0, maximum=0xFFFFFFFF)]
+    mask: UInt32
     low: Octet = 0
     high: Octet = 0xFF
 

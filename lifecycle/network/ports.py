@@ -68,13 +68,8 @@ class EphemeralRange(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.first}–{self.last}"
 
 
-PLATFORMS = {
-    "linux": EphemeralRange(first=32768, last=60999),
-    "macos": EphemeralRange(first=49152, last=65535),
-    "windows": EphemeralRange(first=49152, last=65535),
-}
-"""Each platform's default, as the article gives it; all three can be configured."""
-LINUX = PLATFORMS["linux"]
+LINUX = EphemeralRange(first=32768, last=60999)
+"""The default, which net.ipv4.ip_local_port_range changes."""
 
 
 class ParticipantPorts(msgspec.Struct, frozen=True, kw_only=True):

@@ -14,13 +14,14 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+
+from tests.engines.waiting import within
 
 pytestmark = [
     pytest.mark.thorough,
@@ -56,14 +57,6 @@ def _run(
     )
     assert result.returncode in codes, result.stdout + result.stderr
     return (result.stdout + result.stderr).strip()
-
-
-def _within(timeout_s: float, what: Callable[[], Any]) -> Any:
-    ends_s = time.monotonic() + timeout_s
-    while not (found := what()):
-        assert time.monotonic() < ends_s, "it did not become so"
-        time.sleep(0.3)
-    return found
 
 
 def _python(root: Path) -> None:
@@ -185,7 +178,7 @@ def test_two_pods_are_one_system_whose_nodes_we_restart_and_whose_supervisors_th
 
     def is_ready(machine: str) -> None:
         try:
-            _within(60, lambda: probe(machine, "readiness"))
+            within(60, lambda: probe(machine, "readiness"))
         except AssertionError:
             pytest.fail(podman("logs", names[machine]))
 
@@ -212,13 +205,13 @@ def test_two_pods_are_one_system_whose_nodes_we_restart_and_whose_supervisors_th
         "-c",
         f"import os; os.kill({talker['pid']}, 9)",
     )
-    _within(20, lambda: any(each["restarts"] for each in status("robot")["nodes"]))
+    within(20, lambda: any(each["restarts"] for each in status("robot")["nodes"]))
     is_ready("robot")
     assert inspect("robot", ".RestartCount") == "0"
 
     # A supervisor that is killed is restarted by the engine, and the system is one again.
     os.kill(int(inspect("robot", ".State.Pid")), signal.SIGKILL)
-    _within(20, lambda: inspect("robot", ".RestartCount") == "1")
+    within(20, lambda: inspect("robot", ".RestartCount") == "1")
     for machine in MACHINES:
         is_ready(machine)
     assert inspect("operator", ".RestartCount") == "0"

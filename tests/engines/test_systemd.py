@@ -15,13 +15,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from tests.engines.waiting import within
 from tests.net.hosts import Host, Hosts, lacking
 from tests.second_try import SECOND_TRY
 
@@ -145,15 +146,6 @@ class Machine:
         """Send a process of this machine a signal."""
         assert str(pid) in self.systemctl("status", "--no-pager", self.unit, check=False)
         os.kill(pid, number)
-
-
-def within(timeout_s: float, what: Callable[[], Any]) -> Any:
-    """Wait until something is so, and return it."""
-    ends_s = time.monotonic() + timeout_s
-    while not (found := what()):
-        assert time.monotonic() < ends_s, "it did not become so"
-        time.sleep(0.2)
-    return found
 
 
 @pytest.fixture

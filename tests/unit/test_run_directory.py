@@ -244,6 +244,7 @@ def test_root_asks_the_runs_of_services_and_uses_none_of_their_directories(
     assert find_run(roots, "leg") == services[1] / "leg@1"
     with pytest.raises(UsageError, match=f"running: {tmp_path}/mine/lifecycle/arm@1, {tmp_path}"):
         find_run(roots, "arm")  # of the same name in two places: said by their places
+    assert find_run(roots, str(services[0] / "arm@1")) == services[0] / "arm@1"
     for each in (*held, also):
         each.release()
     monkeypatch.setattr(os, "getuid", lambda: 12345)

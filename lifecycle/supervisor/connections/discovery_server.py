@@ -7,9 +7,9 @@ Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
-import socket
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
@@ -23,7 +23,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
@@ -158,18 +158,22 @@ async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | No
             raise _failed(f"{text}: nobody listened for {START_S:g} s", DEADLINE, log=log)
         if process is not None and discovery_server_listens(planned, process.pid):
             return
-        if process is None and _answers(planned, left_s):
+        if process is None and await _answers(planned, left_s):
             return
         await asyncio.sleep(LOOK_AGAIN_S)
 
 
-def _answers(planned: PlannedServer, timeout_s: float) -> bool:
+async def _answers(planned: PlannedServer, timeout_s: float) -> bool:
     """Return whether it takes a connection from here; over UDP nothing shows that, and it may."""
-    try:
-        if planned.tcp:  # it blocks: nothing runs yet that this could hold up
-            socket.create_connection((planned.address, planned.port), timeout_s).close()
-    except OSError:
-        return False
+    if planned.tcp:
+        try:
+            opening = asyncio.open_connection(planned.address, planned.port)
+            _, writer = await within(timeout_s, opening)
+        except (OSError, asyncio.TimeoutError):
+            return False
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
     return True
 
 

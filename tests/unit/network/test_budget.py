@@ -7,12 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.network.ports import (
-    PLATFORMS,
+    LINUX,
     EphemeralRange,
     describe_domains,
     max_participants,
     overflows,
 )
+
+PLATFORMS = {"linux": LINUX, "macos": EphemeralRange(first=49152, last=65535)}
 
 HINT = (
     "use another domain, run fewer processes, or give fewer publishers a flow of their own "

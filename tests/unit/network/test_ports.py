@@ -13,7 +13,6 @@ from lifecycle.network.ports import (
     EPHEMERAL_RANGE_FILE,
     LINUX,
     PARTICIPANTS_PER_DOMAIN,
-    PLATFORMS,
     Capacity,
     EphemeralRange,
     ParticipantPorts,
@@ -30,7 +29,7 @@ from lifecycle.network.ports import (
     unique_flow_ports,
 )
 
-MACOS, WINDOWS = PLATFORMS["macos"], PLATFORMS["windows"]
+MACOS = WINDOWS = EphemeralRange(first=49152, last=65535)
 DOMAINS = st.integers(0, 232)
 RANGE = "use 1 to 65535, lower end first"
 
