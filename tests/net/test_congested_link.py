@@ -23,6 +23,7 @@ from benchmarks.congested_link import (
     rule,
     write_manifest,
 )
+from lifecycle.errors import ExitCode
 from tests.net.hosts import Host, Hosts, lacking
 from tests.net.running import verb_on
 
@@ -70,3 +71,15 @@ def test_a_delay_on_a_congested_link_is_violated_and_ok_once_it_is_programmed(
                 assert "> 50 ms" in until(right, tmp_path / "b", "violated", "violated")
             with rule(MARKED, router, manifest, tmp_path):
                 assert "≤ 50 ms" in until(right, tmp_path / "b", "ok", "ok")
+                assert "measured on b: see" in (tmp_path / "flows.log").read_text()
+                said = apply_where_it_arrives(right, manifest, tmp_path / "b")
+    assert [each.partition(":")[0] for each in said] == ["before", "after"]
+    assert all(" /p1 /n1 → /n2: " in each and "≤ 50 ms" in each for each in said), said
+
+
+def apply_where_it_arrives(host: Host, manifest: Path, runtime: Path) -> list[str]:
+    """Mark the flow on the host that receives it, too; return what was measured of it."""
+    words = ("flows", "apply", str(manifest), "--target", "nft")
+    done = verb_on(host, *words, runtime=runtime)
+    assert done.returncode == ExitCode.OK, done.stdout + done.stderr
+    return [each for each in done.stdout.splitlines() if each.startswith(("before", "after"))]

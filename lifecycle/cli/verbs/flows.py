@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from lifecycle.programming.programmer import Programmer
     from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen, TargetChanges
+    from lifecycle.supervisor.run.looking import JudgedSystem
     from lifecycle.verify.verdict import Verdict
 
 _MEASURED = ("Hz", "p50 ms", "p99 ms", "lost")
@@ -400,13 +401,13 @@ def apply(
     *,
     dry_run: bool,
     treatment: Treatment | None = None,
-) -> int:
+) -> bool:
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
 
     Returns:
-        VIOLATED of a dry run if a network is not as the verified flows want it.
+        Whether a network was, or in a dry run would be, changed.
     """
     from lifecycle.programming.target import PartlyError
 
@@ -420,8 +421,7 @@ def apply(
         raise
     _show_changes(changes, done=not dry_run)
     _show_left_out(programmer.left_out)
-    differs = dry_run and any(each.pending for each in changes)
-    return ExitCode.VIOLATED if differs else ExitCode.OK
+    return any(each.pending for each in changes)
 
 
 def remove(plan: Plan) -> int:
@@ -451,18 +451,68 @@ def _apply(
     """Program networks with the verified flows of a running system.
 
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
+    Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    from lifecycle.supervisor.run.looking import judge_running
-
     options, treatment = read_networks(targets, rest, option="--target")
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
-    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout, strict=False)
+    plan = load_plan(manifest, assignments)
+    seen = _judged(plan, timeout)
     for each in seen.notices:
         click.echo(lines(each), err=True)
     flows = seen.verdict.flows
-    done = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
-    return done or exit_code(seen.verdict, strict=False)
+    changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    if changed and dry_run:
+        return ExitCode.VIOLATED
+    if changed and plan.bounds:
+        seen = _measured_again(seen, plan)
+    return exit_code(seen.verdict, strict=False)
+
+
+def _measured_again(seen: JudgedSystem, plan: Plan) -> JudgedSystem:
+    """Say what was measured before networks were changed, and after; return what is so after."""
+    before = [each for each in seen.verdict.measured if each.bounds]
+    if not before:
+        machine = {each.full_name: each.machine for each in plan.nodes}
+        there = sorted({machine[each.subscription] for each in seen.verdict.flows} - {""})
+        on = f" on {' and '.join(there)}" if there else ""
+        click.echo(
+            lines(f"what arrives is measured{on}: see `lifecycle status {plan.system}` there"),
+            err=True,
+        )
+        return seen
+    click.echo(f"measuring for {_FRESH_S:g} s what has changed", err=True)
+    time.sleep(_FRESH_S)
+    seen = _judged(plan, _SETTLED_S)
+    click.echo(before_and_after(before, seen.verdict.measured))
+    return seen
+
+
+_FRESH_S = 6.0
+"""Then delays are of messages that came after a change: of the last 5 s, reported within 1 s."""
+
+_SETTLED_S = 4.0
+"""Numbers that are not kept then may still be of a queue that was full before the change."""
+
+
+def _judged(plan: Plan, timeout_s: float) -> JudgedSystem:
+    from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
+
+    return with_supervisors_numbers(judge_running(plan, timeout_s=timeout_s, strict=False))
+
+
+def before_and_after(before: Iterable[FlowMeasurement], after: Iterable[FlowMeasurement]) -> str:
+    """Return what was measured of each flow with declared numbers, in a line for each time."""
+    now = {each.pair: each for each in after}
+    said = []
+    for each in before:
+        if each.bounds:
+            then = now.get(each.pair)
+            said.append(f"before: {each.describe()}")
+            said.append(
+                f"after:  {f'{each.name}: not measured' if then is None else then.describe()}"
+            )
+    return lines("\n".join(said))
 
 
 @command.command("remove")
