@@ -1,20 +1,23 @@
 """The ROS 2 distributions that are supported: what each calls its parts, and which is installed.
 
-Owns: the one table of versions. What is the same in all of them is not in it: the structs of rcl 9
-and 10 and the functions of Fast DDS 2.14 and 3.2 that are used here are. Must not import rclpy.
+What is the same in all of them is not in the table: the structs of rcl 9 and 10 and the functions
+of Fast DDS 2.14 and 3.2 that are used here are. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import functools
+import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from lifecycle.errors import MiddlewareError
+from lifecycle.errors import MiddlewareError, UsageError
+from lifecycle.network.medium import DEFAULT_RMW
 
 
 class Distribution(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,3 +142,25 @@ def _ament_version() -> str:
         return ""
     found = re.search(r"<version>\s*([^<\s]+)\s*</version>", text)
     return found.group(1) if found else ""
+
+
+_RMW_VARIABLES = ("RMW_IMPLEMENTATION", "RCL_ASSERT_RMW_ID_MATCHES")
+"""Both are checked by rcl (rcl/rmw_implementation_identifier_check.c)."""
+
+
+def check_rmw(environment: Mapping[str, str]) -> None:
+    """Refuse an RMW whose library is nowhere that the loader looks: rcl would end this process.
+
+    Raises:
+        UsageError: no participant could be made with it.
+    """
+    folders = [*environment.get("LD_LIBRARY_PATH", "").split(os.pathsep), f"{sys.prefix}/lib"]
+    for variable in _RMW_VARIABLES:
+        rmw = environment.get(variable) or DEFAULT_RMW
+        if rmw != DEFAULT_RMW and not any(
+            Path(folder, f"lib{rmw}.so").is_file() for folder in folders
+        ):
+            raise UsageError(
+                f"cannot use {variable}={rmw!r}: this installation of ROS 2 cannot load that RMW",
+                hint=f"install it, or unset {variable}: the default is {DEFAULT_RMW}",
+            )

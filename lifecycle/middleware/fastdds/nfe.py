@@ -33,7 +33,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.versions import INSTALL, private
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (

@@ -26,12 +26,11 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import has_shared_memory
-from lifecycle.middleware.fastdds.static_edp import check_endpoint
+from lifecycle.middleware.fastdds.factory import has_shared_memory
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings, check_endpoint
 from lifecycle.middleware.rcl import abi, hidden_node
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.rcl.hidden_node import quiet_node
-from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from lifecycle.export.programs import CapturedProgram
-from lifecycle.middleware.discovery.prefixes import is_of_process
+from lifecycle.middleware.process.prefixes import is_of_process
 from lifecycle.plan.secrets import shown
 
 _LONGEST_VALUE = 8192

@@ -26,14 +26,21 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.environment import is_served, reach, settle_s
-from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
-from lifecycle.middleware.discovery.prober import Settling
-from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.profiles import DISCOVERY_SERVER_VARIABLE, FORGOTTEN_S
-from lifecycle.middleware.fastdds.settings import observer_settings
-from lifecycle.middleware.process.hosted import is_vouched_for
+from lifecycle.middleware.fastdds.discovery import is_served, reach, settle_s
+from lifecycle.middleware.fastdds.factory import observer_settings
+from lifecycle.middleware.fastdds.prober import Settling
+from lifecycle.middleware.fastdds.profiles import (
+    DISCOVERY_SERVER_VARIABLE,
+    FORGOTTEN_S,
+    ParticipantSettings,
+)
+from lifecycle.middleware.fastdds.sockets import give_up_dead_connections, is_used
+from lifecycle.middleware.process.prefixes import (
+    PROCESS_DIGITS,
+    is_of_host,
+    is_of_process,
+    is_vouched_for,
+)
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import (
     OF_SERVICES,

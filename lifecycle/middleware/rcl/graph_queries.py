@@ -22,7 +22,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import UNKNOWN_QOS
-from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.tool_filter import known_node
 

@@ -1,14 +1,18 @@
-"""Where participants are looked for: by discovery settings in the environment and by URLs.
+"""Where participants are looked for: by settings in the environment, by URLs, by a server.
 
 Owns: which UDP ports a participant of this process asks in order to find others, and where it
 cannot ask: over shared memory and TCP, behind a discovery server, and where the user's own settings
-of Fast DDS choose transports or peers. Must not import rclpy.
+of Fast DDS choose transports or peers; the command line and environment of
+`fast-discovery-server`, and whether one listens. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
+import os
+import shutil
+import sysconfig
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -21,16 +25,21 @@ from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     default_profile,
 )
-from lifecycle.middleware.fastdds.sockets import open_sockets, udp_sockets
+from lifecycle.middleware.fastdds.sockets import (
+    interface_addresses,
+    open_sockets,
+    sockets_in,
+    udp_sockets,
+)
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.process.control import interface_addresses
+from lifecycle.middleware.versions import DISTRIBUTIONS, INSTALL, installed
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
+from lifecycle.network.medium import DEFAULT_TCP, RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
 from lifecycle.network.nfe import parse_address
 from lifecycle.network.ports import (
     DG,
@@ -39,6 +48,7 @@ from lifecycle.network.ports import (
     participant_ports,
     unicast_pairs,
 )
+from lifecycle.plan.model import PlannedServer
 
 SETTLE_S = 3.5
 """Within so long everybody is known: Fast DDS announces itself, and sends again what was lost, each
@@ -308,3 +318,72 @@ def discovery_peers(
     ]
     group = participant_ports(domain_id, 0).discovery_multicast
     return ((DISCOVERY_GROUP[RMW_DISCOVERY], group), *found)
+
+
+_PROGRAM = "fast-discovery-server"
+_LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
+
+
+def discovery_server_command(
+    server: PlannedServer, environment: Mapping[str, str] | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the command line of a discovery server, and the whole environment it needs.
+
+    Args:
+        server: address, port and transport; the address must be this host's.
+        environment: what it otherwise gets; None for this process's.
+
+    Raises:
+        MiddlewareError: the program is not installed.
+    """
+    options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
+    command = (_program(), *installed().server_arguments)
+    argv = (*command, "-i", "0", *options, str(server.port))  # the id that clients expect
+    current = dict(os.environ if environment is None else environment)
+    # A profile or a server of the environment's would be applied to the server itself.
+    for variable in (
+        *(each.profiles_variable for each in DISTRIBUTIONS),
+        TRANSPORTS_VARIABLE,
+        DISCOVERY_SERVER_VARIABLE,
+    ):
+        current.pop(variable, None)
+    current["SKIP_DEFAULT_XML"] = "1"
+    paths = [*_library_paths(), *filter(None, current.get("LD_LIBRARY_PATH", "").split(":"))]
+    current["LD_LIBRARY_PATH"] = ":".join(dict.fromkeys(paths))
+    return argv, current
+
+
+def discovery_server_listens(server: PlannedServer, pid: int | None = None) -> bool:
+    """Return whether the server's port is open on this host, as the kernel says.
+
+    Args:
+        server: address, port and transport.
+        pid: of the server, whose network is looked at; None for this process's.
+    """
+    owner, name = "self" if pid is None else str(pid), "tcp" if server.tcp else "udp"
+    table, kind = Path("/proc", owner, "net", name), DEFAULT_TCP if server.tcp else RMW_DISCOVERY
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return any(
+            each.port == server.port
+            and each.address in (server.address, kind.any_address)
+            and (not server.tcp or state == _LISTEN)
+            for each, state in sockets_in(table, kind)
+        )
+    return False
+
+
+def _program() -> str:
+    for directory in (sysconfig.get_path("scripts"), None):
+        found = shutil.which(_PROGRAM, path=directory)
+        if found is not None:
+            return found
+    raise MiddlewareError(
+        f"cannot find {_PROGRAM!r}", hint=f"it comes with Fast DDS; set PATH, or {INSTALL}"
+    )
+
+
+def _library_paths() -> list[str]:
+    """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
+    data, pure = (Path(sysconfig.get_path(each)) for each in ("data", "purelib"))
+    places = (data / "lib", pure / "ros_fastrtps.libs", pure / "ros_fastdds.libs")
+    return [str(place) for place in places if place.is_dir()]
