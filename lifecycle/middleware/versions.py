@@ -87,25 +87,18 @@ INSTALL = (
 
 @functools.lru_cache(maxsize=1)
 def installed() -> Distribution:
-    """Return the distribution whose rcl this Python imports; Jazzy where it is not known.
-
-    Its names do no harm there: what is loaded is looked at before it is used.
-    """
+    """Return the distribution whose rcl this Python imports; Jazzy where it is not known."""
     return of_rcl(rcl_version()) or JAZZY
 
 
 def of_rcl(version: str) -> Distribution | None:
-    """Return the distribution with this version of rcl, empty for any; None if it is not known."""
+    """Return the distribution with a version of rcl, empty for any; None if it is not known."""
     major = version.partition(".")[0] or JAZZY.rcl_major
     return next((each for each in DISTRIBUTIONS if each.rcl_major == major), None)
 
 
 def private(owner: object, name: str, what: str) -> Any:
-    """Return what an object of rclpy has under a private name.
-
-    Raises:
-        MiddlewareError: it has nothing there: this rclpy is built otherwise than those known.
-    """
+    """Return what an object of rclpy has under a private name, or refuse an rclpy without it."""
     found = getattr(owner, name, None)
     if found is None:
         raise MiddlewareError(

@@ -109,9 +109,9 @@ def reach(
     Args:
         domain_id: 0–232.
         urls: its own; none for what the RMW does by itself.
-        environment: where ROS_AUTOMATIC_DISCOVERY_RANGE is looked up, for URLs that leave discovery
-            open. OFF asks nobody, SUBNET (the default) this host, by multicast, and those of
-            ROS_STATIC_PEERS, everything else this host only.
+        environment: has ROS_AUTOMATIC_DISCOVERY_RANGE, for URLs that leave discovery open. OFF asks
+            nobody, SUBNET (the default) this host, by multicast, and those of ROS_STATIC_PEERS,
+            everything else this host only.
 
     Returns:
         One per address family; none where others cannot be asked, or may only be from one port.
@@ -168,10 +168,7 @@ def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] 
 
 
 def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
-    """Return the ports of this process on which participants receive discovery.
-
-    Read from the kernel, never inferred: a taken port moves a participant to another one.
-    """
+    """Return the ports of this process on which participants receive discovery, as bound."""
     ports = participant_ports(domain_id, 0)
     possible = range(ports.discovery_unicast, ports.discovery_multicast + DG, 2)
     return tuple(sorted({e.port for e in open_sockets() if e.kind == kind and e.port in possible}))
@@ -233,10 +230,10 @@ def missing_port(
 
 
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:
-    """Whether the user's own settings of Fast DDS say how participants without URLs are found.
+    """Whether the user's own settings say how participants without URLs are found.
 
-    A discovery server, transports, or where to look for others: then nothing may be asked over
-    UDP, which those settings may have ruled out. An RMW without DDS has nothing that answers.
+    Then nothing may be asked over UDP, which those settings may have ruled out. An RMW without DDS
+    has nothing that answers.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return True
@@ -249,8 +246,7 @@ def chosen_otherwise(environment: Mapping[str, str]) -> bool:
 def _connects_first(environment: Mapping[str, str]) -> bool:
     """Return whether participants, once discovered, make TCP connections before they say more.
 
-    So it is with LARGE_DATA, where the range does not choose other transports, and with a file of
-    profiles that has TCP. An answer by UDP says nothing then of what a participant has.
+    An answer by UDP says nothing then of what a participant has.
     """
     builtin = environment.get(TRANSPORTS_VARIABLE, "").upper()
     if builtin.startswith("LARGE_DATA") and _range(environment) != "LOCALHOST":
@@ -285,10 +281,9 @@ def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
-    """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
+    """Return ROS_STATIC_PEERS, which rmw reads, with these hosts beside those of the user's.
 
-    Participants without UDP over IPv4 would look for no others then, so where the user's settings
-    take it away, nothing is added.
+    Nothing is added for participants without UDP over IPv4: they would look for no others then.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
@@ -299,15 +294,12 @@ def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> M
 def discovery_peers(
     domain_id: int, hosts: Mapping[str, int], environment: Mapping[str, str]
 ) -> tuple[tuple[str, int], ...]:
-    """Return where participants of these hosts are looked for, beside multicast.
+    """Return addresses and UDP ports where participants are looked for, multicast among them.
 
     Args:
         domain_id: 0–232.
         hosts: by IP address, how many participants may be there.
-        environment: where settings of Fast DDS are looked up.
-
-    Returns:
-        Addresses and UDP ports; nothing where the user's own settings say how others are found.
+        environment: if it says how others are found, nothing is returned.
     """
     if not hosts or chosen_otherwise(environment):
         return ()
@@ -327,10 +319,10 @@ _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 def discovery_server_command(
     server: PlannedServer, environment: Mapping[str, str] | None = None
 ) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the command line of a discovery server, and the whole environment it needs.
+    """Return the command line of a discovery server on this host, and its whole environment.
 
     Args:
-        server: address, port and transport; the address must be this host's.
+        server: address, port and transport.
         environment: what it otherwise gets; None for this process's.
 
     Raises:
@@ -354,12 +346,7 @@ def discovery_server_command(
 
 
 def discovery_server_listens(server: PlannedServer, pid: int | None = None) -> bool:
-    """Return whether the server's port is open on this host, as the kernel says.
-
-    Args:
-        server: address, port and transport.
-        pid: of the server, whose network is looked at; None for this process's.
-    """
+    """Return whether the server's port is open in the network of a process, None for ours."""
     owner, name = "self" if pid is None else str(pid), "tcp" if server.tcp else "udp"
     table, kind = Path("/proc", owner, "net", name), DEFAULT_TCP if server.tcp else RMW_DISCOVERY
     with contextlib.suppress(FileNotFoundError, ProcessLookupError):

@@ -228,9 +228,9 @@ _LOCALHOST_ONLY = "ROS_LOCALHOST_ONLY"
 def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
-    An observer needs none, and a process that is killed while it holds the mutex of a port there
-    blocks each process that sends to it for 10 s at a time. It is chosen where these settings, a
-    profile or the environment say what transports there are, and by another RMW.
+    A process that is killed while it holds the mutex of a port there blocks each process that sends
+    to it for 10 s at a time. It is chosen where these settings, a profile or the environment say
+    what transports there are, and by another RMW.
     """
     if get_rmw_implementation_identifier() != RMW or _fast_dds_refusal():
         return settings
@@ -257,10 +257,8 @@ def _localhost_peers() -> tuple[str, ...] | None:
 def discovery_by_profile(settings: ParticipantSettings) -> Iterator[None]:
     """Have rmw leave discovery to the profile of a context that is initialised in the block.
 
-    rcl reads the range from the environment then (rcl/discovery_options.h).
-
-    Args:
-        settings: that the context's participant gets; what they leave open stays as it is.
+    rcl reads the range from the environment then (rcl/discovery_options.h). What `settings` leave
+    open stays as it is.
     """
     is_left = settings.chooses_transports and _localhost_peers() is not None
     if not (settings.governs_discovery or is_left):
@@ -281,8 +279,7 @@ _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDic
 def has_shared_memory(node: Node) -> bool:
     """Return whether the participant of `node` has a shared memory transport.
 
-    Of one that was made otherwise than by this package it is what the process has: segments of Fast
-    DDS in /dev/shm.
+    Of one that was made otherwise than by this package it is what the process has.
     """
     noted = _SHARED_MEMORY_OF.get(node.context)
     return bool(own_segments()) if noted is None else noted
@@ -292,17 +289,17 @@ def has_shared_memory(node: Node) -> bool:
 def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
     """Give the participant of `context` these settings: construct its first node in the block.
 
-    Participants that other contexts get inside the block have the settings as well.
+    Participants that other contexts get inside the block have the settings as well. Empty ones
+    change nothing, and need no Fast DDS.
 
     Args:
-        context: initialised in `discovery_by_profile`, without a node yet; otherwise it has no
-            effect.
-        settings: empty ones change nothing, and need no Fast DDS.
+        context: initialised in `discovery_by_profile`; without effect if it has a node already.
+        settings: of the participant.
 
     Raises:
         MiddlewareError: another RMW than rmw_fastrtps_cpp, an unknown version of it, a default
-            profile that already chooses transports, or URLs with an address that this host has
-            not, or a port that is taken; nothing was changed.
+            profile that already chooses transports, or URLs with an address that this host has not,
+            or a port that is taken; nothing was changed.
     """
     before = own_segments()
     with _applied(context, settings) if settings else contextlib.nullcontext():
@@ -366,14 +363,7 @@ def unknown_versions() -> str:
 
 
 def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
-    """Refuse nodes that could not connect with the libraries that are loaded here.
-
-    Args:
-        nodes: that processes of ours host.
-
-    Raises:
-        MiddlewareError: with the place in the manifest.
-    """
+    """Refuse nodes in hosts of ours that the libraries loaded here could not connect."""
     rcl, fast_dds = abi.refusal(), _fast_dds_refusal()
     for node in nodes:
         for each in node.endpoints if rcl else ():

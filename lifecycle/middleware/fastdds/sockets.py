@@ -77,7 +77,9 @@ def sockets_here() -> Iterator[socket.socket]:
 
     What is set on a duplicate is set on the original.
     """
-    for number in socket_descriptors():
+    for number, to in open_files():
+        if not to.startswith("socket:"):
+            continue
         with contextlib.suppress(OSError):  # closed since, or no socket any more
             duplicate = os.dup(number)
             try:
@@ -87,11 +89,6 @@ def sockets_here() -> Iterator[socket.socket]:
                 continue
             with each:
                 yield each
-
-
-def socket_descriptors() -> list[int]:
-    """Return the descriptors of this process that are sockets."""
-    return [number for number, to in open_files() if to.startswith("socket:")]
 
 
 def open_sockets() -> tuple[OpenSocket, ...]:
@@ -125,11 +122,7 @@ def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
 
 
 def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str], ...]:
-    """Return the name of an interface and an address of it, for all that this host has.
-
-    Args:
-        families: AF_INET, AF_INET6 or both.
-    """
+    """Return each address of this host, AF_INET or AF_INET6, and the name of its interface."""
     import psutil  # 15 ms, which few processes need
 
     return tuple(
@@ -141,11 +134,7 @@ def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str
 
 
 def check_host(urls: Sequence[ConnectionUrl]) -> None:
-    """Refuse URLs whose own address or interface this host has not.
-
-    Raises:
-        MiddlewareError: names the URL and what there is.
-    """
+    """Refuse URLs whose own address or interface this host has not, by MiddlewareError."""
     names = {name for _, name in socket.if_nameindex()}
     addresses = {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
     for url in urls:
@@ -163,13 +152,10 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
 
 
 def check_free(urls: Sequence[ConnectionUrl]) -> None:
-    """Refuse URLs with a port that is taken, before a participant is made of them.
+    """Refuse URLs with a port that is taken, by MiddlewareError; who is leaving is waited for.
 
     Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
-    TCP port, so that must not be found out afterwards. Who is just leaving is waited for.
-
-    Raises:
-        MiddlewareError: names the URL and the port.
+    TCP port, so that must not be found out afterwards.
     """
     for url in urls:
         protocol = "TCP" if url.transport.is_tcp else "UDP"
@@ -190,11 +176,7 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
 
 
 def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
-    """Yield duplicates of this process's sockets that `nfes` names, as `sockets_here` does.
-
-    Raises:
-        MiddlewareError: there is none.
-    """
+    """Yield those of `sockets_here` that `nfes` name; raises MiddlewareError if there is none."""
     wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
     is_found = False
     for each, bound in _bound_here():
@@ -213,8 +195,7 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
 def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
     """Mark every socket of this process that `nfes` names, and read the marks back.
 
-    Everything the participant sends carries the mark, 0–63, its discovery as well. The two ECN bits
-    of the byte stay 0.
+    Everything the participant sends carries the mark, 0–63, its discovery as well.
 
     Raises:
         MiddlewareError: no socket found, or the kernel kept another value.
@@ -224,11 +205,7 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
 
 
 def mark(made: socket.socket, dscp: int) -> None:
-    """Have a socket send with a DSCP, 0–63.
-
-    Raises:
-        MiddlewareError: the kernel does not allow it.
-    """
+    """Have a socket send with a DSCP, 0–63; raises MiddlewareError if the kernel does not."""
     option = DSCP_OPTION[made.family]
     try:
         made.setsockopt(*option, tos(dscp))
@@ -239,23 +216,16 @@ def mark(made: socket.socket, dscp: int) -> None:
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
-    """Return every DSCP that the sockets named by `nfes` send with; one if all are marked alike.
-
-    Raises:
-        MiddlewareError: no socket found.
-    """
+    """Return every DSCP that the sockets named by `nfes` send with, see `own_sockets`."""
     return {each.getsockopt(*DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
 def widen_discovery_buffers(domain_id: int) -> int:
     """Give the sockets on which this process receives discovery room for many participants.
 
-    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: a quarter
-    of what twenty participants announce. Data keep their buffers: what waits in a large one is
-    late. The kernel gives no more than twice net.core.rmem_max (socket(7)).
-
-    Returns:
-        How many sockets have more room than before.
+    Fast DDS 2.14 leaves them the system's default, which holds a quarter of what twenty
+    participants announce. Data keep their buffers: what waits in a large one is late. Returns how
+    many have more room than before.
     """
     first = participant_ports(domain_id, 0).discovery_multicast
     ports = range(first, first + DG, 2)
@@ -298,11 +268,7 @@ def _is_free(kind: Medium, address: str, port: int) -> bool:
 
 
 def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
-    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex.
-
-    Raises:
-        OSError: there is no such table.
-    """
+    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         fields = line.split()
         written, _, port = fields[1].partition(":")
@@ -390,8 +356,7 @@ _TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
 def send_again_soon() -> int:
     """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
 
-    Returns:
-        How many sockets heed it: 0 before Linux 6.15, which has no such option.
+    Returns how many heed it: 0 before Linux 6.15, which has no such option.
     """
     count = 0
     for each in _connections():

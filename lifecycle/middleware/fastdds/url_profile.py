@@ -1,8 +1,7 @@
 """Transports of a participant in its Fast DDS profile, with their locators and discovery.
 
-Owns: the grouping of connection URLs into Fast DDS transports; the XML of transports, of where data
-and discovery arrive and discovery is sent to, and of discovery servers. Must not import rclpy;
-reads no environment.
+Owns: the grouping of connection URLs into Fast DDS transports, and the XML of profiles' elements.
+Must not import rclpy; reads no environment.
 
 Two URLs of one family (IPv4 UDP and a group over IPv4) share one transport: with two of a kind Fast
 DDS would send everything twice.

@@ -1,9 +1,8 @@
 """Hang detection between two processes: a page that one writes when it is busy and the other reads.
 
-Owns: the page of memory that the two processes share, and when the watcher looks at it. The busy
-one writes the time into the page. The watcher looks once per limit, and when something that it saw
-may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps
-it from noticing then. Must not import rclpy.
+The busy one writes the time into the page. The watcher looks once per limit, and when something
+that it saw may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor
+SIGSTOP keeps it from noticing then. Must not import rclpy.
 
 Time during which the thread could have run and got no processor is not its own. The kernel counts
 it for each thread (run_delay of /proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up
@@ -63,10 +62,7 @@ class _Turns(typing.NamedTuple):
 
 @typing.final
 class BusySign:
-    """Shared by one thread that is busy or idle and one process that watches it; `close` it.
-
-    Both sides read CLOCK_MONOTONIC, so they must be on one host.
-    """
+    """Shared by one thread that is busy or idle and one process of this host that watches it."""
 
     def __init__(self, page: int) -> None:
         self._page = page
@@ -80,11 +76,7 @@ class BusySign:
 
     @classmethod
     def make(cls, limit_s: float) -> BusySign:
-        """Make a sign whose holder may be busy for `limit_s` seconds, > 0, at a time.
-
-        Raises:
-            MiddlewareError: the kernel refused.
-        """
+        """Make a sign whose holder may be busy for `limit_s` seconds, > 0, at a time."""
         try:
             page = os.memfd_create("lifecycle-busy", os.MFD_CLOEXEC)
             os.ftruncate(page, _PAGE_BYTES)
@@ -158,10 +150,7 @@ class BusySign:
         return why if why is not said else None, (limit - own if part < own < limit else part) / _NS
 
     def _own_ns(self, since: int, now: int, turns: _Turns | None) -> int:
-        """Return for how much of the time since then the holder ran, or waited for something else.
-
-        It is at most the truth: so a hang on an overloaded machine is noticed later.
-        """
+        """Return for how much of the time since then it ran, or waited for something else."""
         if turns is None:  # a kernel that does not count: all of the time is its own
             return now - since
         if self._overdue is None or self._overdue.thread != turns.thread:
@@ -188,15 +177,9 @@ class BusySign:
         return text.partition(b"\0")[0].decode(errors="replace")
 
     def where(self, pid: int) -> str:
-        """Return where the threads of the holder stand, as faulthandler writes it.
+        """Return where the threads of the holder stand, as faulthandler writes it, within 0.25 s.
 
-        Waits for up to a quarter of a second.
-
-        Args:
-            pid: of the holder.
-
-        Returns:
-            Empty if it does not answer: it was stopped, or is not one of ours.
+        Empty if it does not answer: it was stopped, or is not one of ours.
         """
         answers = pid > 0 and self._words[_ANSWERS]
         return _stacks_of(pid, self._page, _PAGE_BYTES) if answers else ""
@@ -270,13 +253,7 @@ def show_stacks_here() -> None:
 
 
 def _stacks_of(pid: int, descriptor: int, keep_bytes: int) -> str:
-    """Return the stacks of a process that answers into a file; empty if it does not in time.
-
-    Args:
-        pid: of the process.
-        descriptor: of the file.
-        keep_bytes: its beginning, which is something else.
-    """
+    """Return the stacks of a process that answers into a file, behind what it keeps there."""
     try:
         os.ftruncate(descriptor, keep_bytes)
         os.kill(pid, _SIGNAL)
@@ -297,8 +274,7 @@ def brief(stacks: str) -> str:
     """Return where the code of a callback stands; empty where no thread is in one.
 
     The function that was called back, and the last ones that it called: `hear (robot.py:12) > read
-    (robot.py:40)`. What is neither below our executor nor rclpy's is no callback; what belongs to
-    these, or to Python, is left out.
+    (robot.py:40)`. What belongs to our executor, rclpy or Python is left out.
     """
     found = []
     for thread in re.split(r"\n\n|(?=Current thread|Thread 0x)", stacks):

@@ -1,10 +1,9 @@
 """What this process may use and how it ends: limits, privileges, children, leaving DDS.
 
-Owns: the limits that are set for a process, and whether there is room for participants within those
-that are in force; what Python does not offer of Linux's process control, prctl(2), capset(2) and a
-timer that exits, through ctypes; and leaving DDS in the order that notifies peers at once and
-leaves nothing in /dev/shm, within a bound. Must not import rclpy: a fork server uses it before
-rclpy is loaded.
+Owns: limits of a process, and whether there is room for participants within them; what Python does
+not offer of Linux's process control, through ctypes: prctl(2), capset(2), a timer that exits; and
+leaving DDS in the order that notifies peers at once and leaves nothing in /dev/shm, within a bound.
+Must not import rclpy: a fork server uses it before rclpy is loaded.
 """
 
 from __future__ import annotations
@@ -58,11 +57,7 @@ def limit_resources(limits: Iterable[tuple[str, int]]) -> None:
 
 
 def check_threads(count: int) -> None:
-    """Make sure that so many threads can be started now.
-
-    Raises:
-        MiddlewareError: they cannot; names the limits that hold.
-    """
+    """Make sure that so many threads can be started now; else MiddlewareError names the limits."""
     over = threading.Event()
     threads: list[threading.Thread] = []
     try:
@@ -83,11 +78,7 @@ _OWN_DESCRIPTORS, _DESCRIPTORS_EACH = 36, 8
 
 
 def check_descriptors(processes: int) -> None:
-    """Make sure that a supervisor of so many processes may open what it needs.
-
-    Raises:
-        MiddlewareError: it may not; names the limit.
-    """
+    """Make sure that a supervisor may open what so many processes need; else MiddlewareError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = _OWN_DESCRIPTORS + _DESCRIPTORS_EACH * processes
     if soft != resource.RLIM_INFINITY and soft < needed:
@@ -106,12 +97,9 @@ _LEAST_ADDRESSES_KIB = 1_400_000
 
 
 def check_memory() -> None:
-    """Make sure that this process may map what a participant takes.
+    """Make sure that this process may map what a participant takes; else MiddlewareError.
 
     With less the C library ends a process whose thread it has no memory for, in the middle of all.
-
-    Raises:
-        MiddlewareError: it may not; names the limit.
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     is_limited = soft != resource.RLIM_INFINITY
@@ -165,10 +153,10 @@ def _limits() -> str:
 
 
 def machine_id() -> str:
-    """Return what distinguishes this machine from others.
+    """Return what distinguishes this machine: nodes of one id share memory and loopback.
 
     It is $LIFECYCLE_MACHINE_ID where that is set, else /etc/machine-id (machine-id(5)), else the
-    kernel's boot id. Nodes of one id are taken to share memory and loopback.
+    kernel's boot id.
     """
     return os.environ.get(MACHINE_ID_VARIABLE) or _own_machine_id()
 
@@ -206,19 +194,12 @@ def adopt_orphans() -> None:
     """Become the parent of every descendant whose own parent dies (PR_SET_CHILD_SUBREAPER).
 
     They then can be found, signalled and waited for, also after a crash of what was between.
-
-    Raises:
-        MiddlewareError: the kernel refused.
     """
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def refuse_new_privileges() -> None:
-    """Keep this process, and all that it starts, from gaining privileges by execve(2).
-
-    Raises:
-        MiddlewareError: the kernel refused.
-    """
+    """Keep this process, and all that it starts, from gaining privileges by execve(2)."""
     _prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
@@ -226,9 +207,6 @@ def drop_network_administration() -> None:
     """Give up CAP_NET_ADMIN, see capabilities(7), for this process and all that it starts.
 
     What root starts has it again, by the rules for root.
-
-    Raises:
-        MiddlewareError: the kernel refused.
     """
     # struct __user_cap_header_struct, and two of __user_cap_data_struct: effective, permitted and
     # inheritable of capabilities 0 to 31 in the first.
@@ -245,18 +223,12 @@ def drop_network_administration() -> None:
 
 
 def exit_after(seconds: float, code: int) -> Callable[[], None]:
-    """End this process with `code` after `seconds`, whatever its threads do by then.
+    """End this process with `code` (0–255) after `seconds`, whatever its threads do by then.
 
     glibc runs `_exit(code)` itself on a thread of its own, without Python: it also ends a process
     that hangs in C++ with the GIL held, which no Python thread or signal handler can. Where the
-    limit of threads is reached, SIGALRM ends it instead.
-
-    Args:
-        seconds: > 0.
-        code: 0–255.
-
-    Returns:
-        A function that lets it live after all.
+    limit of threads is reached, SIGALRM ends it instead. Returns a function that lets it live after
+    all.
     """
     signal.setitimer(signal.ITIMER_REAL, seconds + _KILLED_S)
     exits = ctypes.cast(_libc()._exit, ctypes.c_void_p).value  # noqa: SLF001 - C's name
@@ -295,8 +267,10 @@ def leave_and_exit(
 ) -> NoReturn:
     """Destroy what is given, flush the standard streams and end the process; never returns.
 
-    Executors must have stopped spinning. Destroying a participant can hang in Fast DDS with the GIL
-    held: at the deadline the process ends with the same code, and its supervisor sweeps /dev/shm.
+    Executors must have stopped spinning. A normal exit sleeps 100 ms in Fast DDS; `os._exit` alone
+    leaves a ghost in the graph for the whole lease and shared memory files for ever. Destroying a
+    participant can hang in Fast DDS with the GIL held: at the deadline the process ends with the
+    same code, and its supervisor sweeps /dev/shm.
 
     Args:
         code: exit code, 0–255.
@@ -325,8 +299,8 @@ def leave_and_exit(
 def _release(node: Any) -> None:
     """Destroy a node and everything hanging on it that would keep its participant alive.
 
-    rclpy's destroy_node forgets action servers and clients and a managed node's state machine;
-    each holds the C++ node, and with it the participant, until it goes itself.
+    rclpy's destroy_node forgets action servers and clients and a managed node's state machine; each
+    holds the C++ node, and with it the participant, until it goes itself.
     """
     for waitable in tuple(node.waitables):
         if hasattr(waitable, "destroy"):

@@ -34,12 +34,7 @@ def is_of_process(prefix: str, pid: int, like: str) -> bool:
 
 
 def is_of_host(prefix: str, like: str) -> bool:
-    """Return whether a participant is one of this host, by its GUID prefix.
-
-    Args:
-        prefix: 24 hex digits.
-        like: the prefix of a participant on this host.
-    """
+    """Return whether a participant is one of the host of another, by their GUID prefixes."""
     return prefix[: _HOST_DIGITS.stop] == like[: _HOST_DIGITS.stop]
 
 
@@ -47,11 +42,7 @@ _held: dict[str, socket.socket] = {}
 
 
 def vouch_for(prefix: str) -> None:
-    """Show that a participant of this process is that of a node in our host; again is harmless.
-
-    Args:
-        prefix: of its GUID, 24 hex digits; nothing is done without one.
-    """
+    """Show that a participant of this process is of a node in our host, if its prefix is known."""
     name = _name(prefix)
     if not prefix or name in _held:
         return
@@ -65,11 +56,7 @@ def vouch_for(prefix: str) -> None:
 
 
 def is_vouched_for(prefix: str) -> bool:
-    """Return whether a process of this machine says so of a participant.
-
-    Args:
-        prefix: of its GUID, 24 hex digits.
-    """
+    """Return whether a process of this machine says so of a participant, by its GUID prefix."""
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as asking:
         return asking.connect_ex(_name(prefix)) == 0
 

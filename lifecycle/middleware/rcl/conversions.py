@@ -33,11 +33,7 @@ _INFINITE_NS = 2**63 - 1
 
 
 def latched(depth: int) -> QoSProfile:
-    """Return rclpy's profile whose last samples DDS keeps for subscriptions that come later.
-
-    Args:
-        depth: samples, ≥ 1.
-    """
+    """Return a profile whose last samples DDS keeps for subscriptions that come later."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
@@ -172,10 +168,7 @@ def parameter_value(value: Any) -> ParameterValue | None:
 
 
 def parameter_to_rclpy(value: ParameterValue, type_: str) -> Any:
-    """Return a value as rclpy wants it for a parameter of `type_`.
-
-    YAML writes 5 where a double is meant, and bytes as a list of integers.
-    """
+    """Return a value as rclpy wants it: YAML writes 5 for a double, and bytes as integers."""
     if isinstance(value, tuple):
         if type_ == "double_array":
             return [float(each) for each in value]

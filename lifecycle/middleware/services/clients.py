@@ -1,8 +1,8 @@
-"""Clients of the lifecycle services and the node configuration of other processes' nodes.
+"""Clients of the lifecycle, parameter and container services and of our node interface.
 
-Owns: the requests to nodes that we reach only through their services, ours or foreign, and how an
-unanswered one is understood: a change_state without a reply is not a failed transition, so the
-state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
+Owns: the requests to nodes that we reach only through their services, and how an unanswered one is
+understood: a change_state without a reply is not a failed transition, so the state is read again
+(rcl_lifecycle, lifecycle_msgs/srv/*).
 """
 
 from __future__ import annotations
@@ -115,8 +115,8 @@ class NodeClients:
     ) -> bool:
         """Ask for one transition, wait until it is over, and return whether it succeeded.
 
-        The request is sent once. While the reply is missing, the state is read now and then: one
-        that has reached the transition's goal counts as the reply.
+        While the reply is missing, the state is read now and then: one that has reached the
+        transition's goal counts as the reply.
 
         Args:
             node: whose state.
@@ -147,10 +147,7 @@ class NodeClients:
     ) -> NodeConfiguration | None:
         """Read the node configuration interface; None where discovery shows none on the node.
 
-        Args:
-            node: that has it.
-            timeout_s: for the answer.
-            expected: the node has one, so that it is waited for if discovery does not show it yet.
+        One that is `expected` is waited for if discovery does not show it yet.
         """
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
@@ -169,13 +166,8 @@ class NodeClients:
     ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
-        The request is sent once; while the reply is missing, what the container has counts as one.
-
-        Returns:
-            What has the container unload it again; raises as this does.
-
-        Raises:
-            MiddlewareError: also where composition_interfaces is not installed.
+        While the reply is missing, what the container has counts as one. Returns what has it unload
+        the node again; raises as this does.
         """
         what = f"load {node.run.component!r} into {container!r}"
         try:
@@ -268,14 +260,14 @@ class NodeClients:
     async def _read_parameters(
         self, node: str, names: Collection[str] | None, *, timeout_s: float
     ) -> list[tuple[ParameterDescriptor, str, ParameterValue | None]]:
-        """Read parameters of a node: descriptor, our name of the type, and value; sorted by name.
+        """Read descriptor, our name of the type, and value of parameters of a node, sorted by name.
 
         One that is declared and not set has an empty type and no value.
 
         Args:
             node: fully qualified name.
             names: those that it has of these; None for all.
-            timeout_s: seconds, > 0, for each request; raises as `ServiceCalls.call`.
+            timeout_s: for each request.
         """
 
         async def ask(service: str, type_: type[Any], **fields: Any) -> Any:
@@ -334,7 +326,7 @@ class NodeClients:
         Args:
             node: whose they are.
             values: by parameter.
-            types: by parameter, names of rcl_interfaces: "int", "double_array".
+            types: by parameter, "int", "double_array".
         """
         given = _messages(
             Parameter(name, PARAMETER_TYPES[types[name]], values[name]) for name in values
@@ -351,8 +343,7 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Return whether a node has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service: if that is shown alone,
-        there are none.
+        Client libraries make them before the type description service.
         """
         offered = self._observer.services_of(node)
         if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
@@ -364,11 +355,8 @@ class NodeClients:
     ) -> bool | None:
         """Return whether a node answers one small request; None where it serves nothing to ask.
 
-        Args:
-            node: that is asked.
-            managed: it has a state, which is asked for; else it is asked for no parameter.
-            timeout_s: for the answer.
-            repeat: see ServiceCalls; else a reply that is lost is none.
+        A `managed` one is asked for its state, another for no parameter. Unless `repeat`, a reply
+        that is lost is none.
         """
         type_ = GetState if managed else GetParameters
         service = f"{node}/get_{'state' if managed else 'parameters'}"
@@ -457,11 +445,7 @@ class NodeClients:
         qos: QosProfile,
         callback: Callable[[bytes, Mapping[str, int]], None],
     ) -> None:
-        """Have `callback` called with each message of a topic, serialized, and its message info.
-
-        Raises:
-            MiddlewareError: the type is not installed here.
-        """
+        """Have `callback` called with each message of a topic, serialized, and its message info."""
         self._subscribe(import_interface(type_), topic, callback, to_rclpy(qos), raw=True)
 
     def forget(self, node: str) -> None:
@@ -532,11 +516,7 @@ def _given_values(planned: PlannedNode, has: Mapping[str, str] | None = None) ->
     """Return what a plan gives a node's parameters, by name, but by its command line.
 
     Empty arrays are among them, too: rcl reads none from a command line. One whose type is declared
-    nowhere is given by the type that the node has for it, and not at all where that is unknown.
-
-    Args:
-        planned: the node.
-        has: types of what the node has, by name; None while it is not made.
+    nowhere is given by the type that the node `has` for it, and not at all where that is unknown.
     """
     given = {}
     for each in planned.expected_parameters:

@@ -101,8 +101,7 @@ _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_defa
 class AlivePublisher:
     """Asserts the liveliness of the participant of `node` to its subscribers while it lives.
 
-    Nothing is asserted while there is no subscriber. The thread that asserts is there from the
-    start: there may be no room for another one later.
+    The thread that asserts is there from the start: there may be no room for another one later.
 
     Args:
         node: an executor spins it.
@@ -131,8 +130,7 @@ class AlivePublisher:
     def notify(self, notice: AliveNotice) -> None:
         """Publish which of our nodes are silent, and what else there is to say; from any thread.
 
-        Present and later subscribers receive it. A message may be lost for some seconds: publish
-        it again.
+        A message may be lost for some seconds: publish it again.
         """
         self._publisher.publish(String(data=to_json(notice).decode()))
 
@@ -168,10 +166,10 @@ class AlivePublisher:
 
 @typing.final
 class AliveSubscription:
-    """Follows one AlivePublisher.
+    """Follows one AlivePublisher; callbacks run in the executor that spins `node`.
 
     Args:
-        node: an executor spins it; callbacks run in that executor's thread.
+        node: an executor spins it.
         topic: of the publisher.
         on_liveliness: called with True when it is alive, False when its lease has expired.
         on_left: called when it left properly.
@@ -234,11 +232,10 @@ _KEPT = 64
 
 @typing.final
 class PlanNotices:
-    """Announces our plan and receives those of others; `destroy` it.
+    """Announces our plan and receives those of others, ours too; `destroy` it.
 
-    Args:
-        node: an executor spins it; callbacks run in that executor's thread.
-        on_notice: called with each text that arrives, our own too.
+    The topic's name holds no system: a supervisor that was started with another manifest must be
+    noticed too. Callbacks run in the executor that spins `node`.
     """
 
     def __init__(self, node: Node, on_notice: Callable[[str], None]) -> None:
