@@ -234,7 +234,7 @@ def parts() -> dict[str, tuple[float, int]]:
     from std_msgs.msg import String
     from std_srvs.srv import Trigger
 
-    from lifecycle.middleware.discovery.liveliness import AlivePublisher
+    from lifecycle.middleware.services.supervisor_topics import AlivePublisher
 
     rclpy.init()
     node = LifecycleNode("parts")

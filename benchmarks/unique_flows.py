@@ -65,7 +65,7 @@ def measure(kind: str, count: int) -> NoReturn:
     from lifecycle.manifest.qos import QosProfile
     from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
     from lifecycle.middleware.fastdds.participant import FlowParticipant
-    from lifecycle.middleware.process.teardown import leave_and_exit
+    from lifecycle.middleware.process.control import leave_and_exit
     from lifecycle.network.nfe import UniqueRequirement
 
     context = rclpy.Context()

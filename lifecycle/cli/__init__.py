@@ -164,7 +164,7 @@ def _check_ros(verb: str) -> None:
             hint=_ros_hint(),
         )
     from lifecycle.middleware.process.shared_memory import check_room
-    from lifecycle.middleware.rcl.rmw_choice import check_rmw
+    from lifecycle.middleware.versions import check_rmw
 
     check_room()
     check_rmw(os.environ)
@@ -265,7 +265,7 @@ def program() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     if "rclpy" in sys.modules:
-        from lifecycle.middleware.discovery.prober import leave_all
+        from lifecycle.middleware.fastdds.prober import leave_all
         from lifecycle.middleware.process.shared_memory import holds_shared_memory
 
         leave_all()

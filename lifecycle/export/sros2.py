@@ -33,7 +33,7 @@ OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""
 
 PLANS_TOPIC = "/_lifecycle/plans"
-"""Where supervisors announce their plans (lifecycle.middleware.discovery.liveliness)."""
+"""Where supervisors announce their plans (lifecycle.middleware.services.supervisor_topics)."""
 
 _GRANTS = {
     EndpointKind.PUBLISHER: ("topic", "publish"),

@@ -14,11 +14,9 @@ from collections.abc import Awaitable, Collection, Coroutine, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.diagnostics import DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop, set_within
-from lifecycle.graph.measuring import TopicMeasurements
 from lifecycle.graph.model import GraphChange
-from lifecycle.graph.parameters import Names, ParameterReadings
+from lifecycle.graph.readings import DiagnosticReadings, Names, ParameterReadings, TopicMeasurements
 from lifecycle.graph.state import Answer, GraphState
 from lifecycle.graph.status import NodeStatus
 from lifecycle.plan.model import Plan
@@ -133,7 +131,7 @@ class Observer:
         Waits until every participant that was there before us is seen: an observation that misses
         one would prove nothing about undeclared nodes. Planned nodes whose configuration was not
         put into the state are asked for it and for their state; what they do not answer within a
-        second stays unknown. Parameters that they do not report are read (parameters.py).
+        second stays unknown. Parameters that they do not report are read (readings.py).
 
         Args:
             plan: whose nodes are asked.

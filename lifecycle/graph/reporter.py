@@ -29,7 +29,7 @@ from lifecycle.graph.status import (
     encode,
     new_instance,
 )
-from lifecycle.middleware.rcl.qos import latched
+from lifecycle.middleware.rcl.conversions import latched
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.tool_filter import GRAPH_TOPIC
 

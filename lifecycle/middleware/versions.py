@@ -1,20 +1,23 @@
 """The ROS 2 distributions that are supported: what each calls its parts, and which is installed.
 
-Owns: the one table of versions. What is the same in all of them is not in it: the structs of rcl 9
-and 10 and the functions of Fast DDS 2.14 and 3.2 that are used here are. Must not import rclpy.
+What is the same in all of them is not in the table: the structs of rcl 9 and 10 and the functions
+of Fast DDS 2.14 and 3.2 that are used here are. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import functools
+import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from lifecycle.errors import MiddlewareError
+from lifecycle.errors import MiddlewareError, UsageError
+from lifecycle.network.medium import DEFAULT_RMW
 
 
 class Distribution(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,25 +87,18 @@ INSTALL = (
 
 @functools.lru_cache(maxsize=1)
 def installed() -> Distribution:
-    """Return the distribution whose rcl this Python imports; Jazzy where it is not known.
-
-    Its names do no harm there: what is loaded is looked at before it is used.
-    """
+    """Return the distribution whose rcl this Python imports; Jazzy where it is not known."""
     return of_rcl(rcl_version()) or JAZZY
 
 
 def of_rcl(version: str) -> Distribution | None:
-    """Return the distribution with this version of rcl, empty for any; None if it is not known."""
+    """Return the distribution with a version of rcl, empty for any; None if it is not known."""
     major = version.partition(".")[0] or JAZZY.rcl_major
     return next((each for each in DISTRIBUTIONS if each.rcl_major == major), None)
 
 
 def private(owner: object, name: str, what: str) -> Any:
-    """Return what an object of rclpy has under a private name.
-
-    Raises:
-        MiddlewareError: it has nothing there: this rclpy is built otherwise than those known.
-    """
+    """Return what an object of rclpy has under a private name, or refuse an rclpy without it."""
     found = getattr(owner, name, None)
     if found is None:
         raise MiddlewareError(
@@ -139,3 +135,25 @@ def _ament_version() -> str:
         return ""
     found = re.search(r"<version>\s*([^<\s]+)\s*</version>", text)
     return found.group(1) if found else ""
+
+
+_RMW_VARIABLES = ("RMW_IMPLEMENTATION", "RCL_ASSERT_RMW_ID_MATCHES")
+"""Both are checked by rcl (rcl/rmw_implementation_identifier_check.c)."""
+
+
+def check_rmw(environment: Mapping[str, str]) -> None:
+    """Refuse an RMW whose library is nowhere that the loader looks: rcl would end this process.
+
+    Raises:
+        UsageError: no participant could be made with it.
+    """
+    folders = [*environment.get("LD_LIBRARY_PATH", "").split(os.pathsep), f"{sys.prefix}/lib"]
+    for variable in _RMW_VARIABLES:
+        rmw = environment.get(variable) or DEFAULT_RMW
+        if rmw != DEFAULT_RMW and not any(
+            Path(folder, f"lib{rmw}.so").is_file() for folder in folders
+        ):
+            raise UsageError(
+                f"cannot use {variable}={rmw!r}: this installation of ROS 2 cannot load that RMW",
+                hint=f"install it, or unset {variable}: the default is {DEFAULT_RMW}",
+            )

@@ -32,10 +32,10 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
-from lifecycle.middleware.process.hosted import vouch_for
+from lifecycle.middleware.process.prefixes import vouch_for
+from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
-from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint

@@ -82,7 +82,7 @@ def main() -> None:
 
 def _say(nodes: list[Node], topic: str, index: int) -> None:
     from lifecycle.graph.reporter import STATUS_QOS
-    from lifecycle.middleware.discovery.liveliness import _qos
+    from lifecycle.middleware.services.supervisor_topics import _qos
     from tests.hostile.answers import MESSAGES
 
     node = Node("_ros2cli_teller", enable_rosout=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.discovery_server import (
+from lifecycle.middleware.fastdds.discovery import (
     discovery_server_command,
     discovery_server_listens,
 )

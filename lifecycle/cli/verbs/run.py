@@ -15,9 +15,8 @@ from lifecycle.cli.common import load_manifest
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
-from lifecycle.middleware.discovery.environment import peers_environment
-from lifecycle.middleware.process.control import limit_resources
-from lifecycle.middleware.process.prctl import refuse_new_privileges
+from lifecycle.middleware.fastdds.discovery import peers_environment
+from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
 from lifecycle.plan.build import build_plan, find_node
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedNode

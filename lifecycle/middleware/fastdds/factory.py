@@ -2,11 +2,18 @@
 
 Owns: the eight public functions of Fast DDS that are called in a process of ours, and the only file
 that may call any: ctypes finds them by their mangled names, which are checked when it is loaded.
+And the only moment at which settings can be applied, when the first node of a context is
+constructed; whether a participant has shared memory; and what a library that is not known costs.
 
 Profiles are read from the environment once per process, and rmw_fastrtps gives every participant
 the factory's default QoS. So that default is changed for one participant at a time;
 DomainParticipantQos objects stay opaque, made and destroyed by their own constructor and
 destructor.
+
+For LOCALHOST rmw_fastrtps adds a shared memory and a UDP transport to whatever a profile says
+(create_participant of rmw_fastrtps_shared_cpp), so a participant without shared memory has to bring
+the same discovery in its own profile; for SUBNET it adds a multicast group as soon as there is a
+static peer.
 """
 
 from __future__ import annotations
@@ -15,16 +22,34 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import os
 import threading
-from collections.abc import Iterator, Sequence
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from rclpy.utilities import get_rmw_implementation_identifier
+from msgspec.structs import replace
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.utilities import get_default_context, get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.static_edp import endpoint_profiles
+from lifecycle.middleware.fastdds.profiles import (
+    DISCOVERY_SERVER_VARIABLE,
+    PEERS_VARIABLE,
+    RANGE_VARIABLE,
+    ParticipantSettings,
+    default_profile,
+    endpoint_profiles,
+    profile,
+)
+from lifecycle.middleware.fastdds.sockets import check_free, check_host
+from lifecycle.middleware.process.shared_memory import own_segments
+from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.versions import INSTALL, KNOWN_FAST_DDS, installed
-from lifecycle.plan.model import StaticEndpoint
+from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import PlannedNode, StaticEndpoint
 
 RMW = "rmw_fastrtps_cpp"
 
@@ -35,7 +60,7 @@ _STRING = "NSt7__cxx1112basic_stringIcSt11char_traitsIcESaIcEEE"
 _QOS_ROOM_BYTES = 16384
 """Thirteen times sizeof(DomainParticipantQos) in 2.14.5."""
 _OK = 0
-DRAFT = "lifecycle_draft_of_a_profile"
+_DRAFT = "lifecycle_draft_of_a_profile"
 """The name of a profile, and what those of its transports begin with, before it has one."""
 
 
@@ -118,7 +143,7 @@ def _library() -> _FastDds:
     return _FastDds()
 
 
-def fast_dds_refusal() -> str:
+def _fast_dds_refusal() -> str:
     """Return why the loaded Fast DDS is not used beyond what rmw does; empty if it is, or none."""
     if get_rmw_implementation_identifier() == RMW:
         try:
@@ -129,16 +154,15 @@ def fast_dds_refusal() -> str:
 
 
 @contextlib.contextmanager
-def default_participant(xml: str) -> Iterator[None]:
+def _default_participant(xml: str) -> Iterator[None]:
     """Have participants that are created inside the block made from a profile.
 
-    The default QoS before it is put back exactly, whatever set it. One block at a time: other
-    threads that use this function wait; participants that they create otherwise meanwhile get this
-    profile too.
+    One block at a time: other threads that use this function wait; participants that they create
+    otherwise meanwhile get this profile too.
 
     Args:
-        xml: the profile, not as a default one, with DRAFT for its name. Fast DDS keeps each for
-            good, so equal ones are loaded once.
+        xml: the profile, with _DRAFT for its name. Fast DDS keeps each for good, so equal ones are
+            loaded once.
 
     Raises:
         MiddlewareError: Fast DDS refused it, which it explains on standard error.
@@ -148,7 +172,7 @@ def default_participant(xml: str) -> Iterator[None]:
     data = name.encode()
     text = _String(data=data, size=len(data), capacity=len(data))
     with dds.lock, dds.copied_default() as before, dds.copied_default() as wanted:
-        result = _OK if name in dds.loaded else dds.load(xml.replace(DRAFT, name))
+        result = _OK if name in dds.loaded else dds.load(xml.replace(_DRAFT, name))
         if result == _OK:
             dds.loaded.add(name)
             result = dds.qos_from_profile(dds.factory(), ctypes.byref(text), wanted)
@@ -164,7 +188,7 @@ def default_participant(xml: str) -> Iterator[None]:
             dds.set_default_qos(dds.factory(), before)
 
 
-def load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
+def _load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
     """Have these endpoints made with the ids of their lines in the table of static discovery.
 
     rmw_fastrtps looks for an endpoint's profile by its topic, and Fast DDS keeps the first that it
@@ -195,3 +219,173 @@ def load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
                 hint="profiles of the environment's for the same topics must go",
             )
         dds.static.update(((each.writer, each.profile), each.user_id) for each in new)
+
+
+_LOCALHOST_ONLY = "ROS_LOCALHOST_ONLY"
+"""ROS 2 of before Jazzy has that for a range of LOCALHOST, and it counts first."""
+
+
+def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> ParticipantSettings:
+    """Return the settings of an observer's participant: no shared memory, unless it is chosen.
+
+    A process that is killed while it holds the mutex of a port there blocks each process that sends
+    to it for 10 s at a time. It is chosen where these settings, a profile or the environment say
+    what transports there are, and by another RMW.
+    """
+    if get_rmw_implementation_identifier() != RMW or _fast_dds_refusal():
+        return settings
+    if settings or super_client:
+        connections = replace(settings.connections, super_client=super_client)
+        return replace(settings, connections=connections)
+    with contextlib.suppress(MiddlewareError):  # Fast DDS ignores such a profile
+        base = default_profile()
+        if not (os.environ.get(TRANSPORTS_VARIABLE) or (base and base.chosen_transports)):
+            return replace(settings, transports=(RMW_DISCOVERY,), announces_often=True)
+    return settings
+
+
+def _localhost_peers() -> tuple[str, ...] | None:
+    """Return the static peers where the environment asks for LOCALHOST; None if it does not."""
+    if os.environ.get(_LOCALHOST_ONLY) == "1":
+        return ()
+    if os.environ.get(RANGE_VARIABLE) != "LOCALHOST":
+        return None
+    return tuple(filter(None, os.environ.get(PEERS_VARIABLE, "").split(";")))
+
+
+@contextlib.contextmanager
+def discovery_by_profile(settings: ParticipantSettings) -> Iterator[None]:
+    """Have rmw leave discovery to the profile of a context that is initialised in the block.
+
+    rcl reads the range from the environment then (rcl/discovery_options.h). What `settings` leave
+    open stays as it is.
+    """
+    is_left = settings.chooses_transports and _localhost_peers() is not None
+    if not (settings.governs_discovery or is_left):
+        yield
+        return
+    before = {each: os.environ.pop(each, None) for each in (RANGE_VARIABLE, _LOCALHOST_ONLY)}
+    os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
+    try:
+        yield
+    finally:
+        del os.environ[RANGE_VARIABLE]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+_SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDictionary()
+
+
+def has_shared_memory(node: Node) -> bool:
+    """Return whether the participant of `node` has a shared memory transport.
+
+    Of one that was made otherwise than by this package it is what the process has.
+    """
+    noted = _SHARED_MEMORY_OF.get(node.context)
+    return bool(own_segments()) if noted is None else noted
+
+
+@contextlib.contextmanager
+def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
+    """Give the participant of `context` these settings: construct its first node in the block.
+
+    Participants that other contexts get inside the block have the settings as well. Empty ones
+    change nothing, and need no Fast DDS.
+
+    Args:
+        context: initialised in `discovery_by_profile`; without effect if it has a node already.
+        settings: of the participant.
+
+    Raises:
+        MiddlewareError: another RMW than rmw_fastrtps_cpp, an unknown version of it, a default
+            profile that already chooses transports, or URLs with an address that this host has not,
+            or a port that is taken; nothing was changed.
+    """
+    before = own_segments()
+    with _applied(context, settings) if settings else contextlib.nullcontext():
+        yield
+    # Not by a subscription, whose list has it: one that is announced and taken back while others
+    # discover the participant may cost another participant of the process its subscriptions.
+    opened = not own_segments() <= before
+    # Of the default context others may have made the participant, with what was there before.
+    is_ours = context is not get_default_context() or not before
+    if get_rmw_implementation_identifier() == RMW and (opened or is_ours):
+        _SHARED_MEMORY_OF.setdefault(context, opened)
+
+
+@contextlib.contextmanager
+def _applied(context: Context, settings: ParticipantSettings) -> Iterator[None]:
+    rmw = get_rmw_implementation_identifier()
+    if rmw != RMW:
+        raise MiddlewareError(
+            f"cannot choose the transports of a participant with RMW {rmw!r}",
+            hint=f"set RMW_IMPLEMENTATION={RMW}",
+        )
+    if settings.urls:
+        server = os.environ.get(DISCOVERY_SERVER_VARIABLE, "")
+        if server and not any(url.server for url in settings.urls):
+            raise MiddlewareError(
+                f"cannot connect by {str(settings.urls[0])!r}: {DISCOVERY_SERVER_VARIABLE}="
+                f"{server!r} makes every participant a client of that server",
+                hint=f"unset {DISCOVERY_SERVER_VARIABLE}, or name the server in the URL, "
+                "server=ADDRESS:PORT",
+            )
+        check_host(settings.urls)
+    _load_endpoint_profiles(settings.static_endpoints)
+    is_open = settings.chooses_transports and not settings.governs_discovery
+    xml = profile(
+        _DRAFT,
+        settings,
+        base=default_profile(),
+        localhost_peers=_localhost_peers() if is_open else None,
+        domain_id=context.get_domain_id(),
+    )
+    with _default_participant(xml):
+        # Under its lock: no other participant of ours is made in between.
+        check_free(settings.urls)
+        yield
+
+
+def unknown_versions() -> str:
+    """Return which of the libraries here are not known, and what that costs; empty if all are."""
+    unknown = []
+    if refusal := abi.refusal():
+        unknown.append(
+            f"{refusal}: nodes, endpoints and states are "
+            "verified; network flow endpoints cannot be read or made unique, so that what requires "
+            "them is unverifiable or refused"
+        )
+    if refusal := _fast_dds_refusal():
+        unknown.append(
+            f"{refusal}: participants get no connections, transports or DSCP of their own"
+        )
+    return "; ".join(unknown)
+
+
+def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
+    """Refuse nodes in hosts of ours that the libraries loaded here could not connect."""
+    rcl, fast_dds = abi.refusal(), _fast_dds_refusal()
+    for node in nodes:
+        for each in node.endpoints if rcl else ():
+            if each.unique is UniqueRequirement.STRICTLY_REQUIRED:
+                at = each.at or node.at
+                raise MiddlewareError(
+                    f"{at.spelled}: cannot give {each.kind.noun} {each.name!r} of "
+                    f"{node.key!r} a flow of its own ('unique: strictly_required'): {rcl}",
+                    hint=f"use 'unique: optionally_required', or {INSTALL}",
+                )
+        for key in _chosen(node) if fast_dds else ():
+            raise MiddlewareError(
+                f"{node.at.spelled}: cannot make a participant of {node.key!r} with {key}: "
+                f"{fast_dds}",
+                hint=INSTALL,
+            )
+
+
+def _chosen(node: PlannedNode) -> Iterator[str]:
+    """Yield the keys for which rmw_fastrtps alone cannot make the participants of a node."""
+    if ParticipantSettings.of(node):
+        yield "'connections', 'transport' or 'discovery' as declared"
+    for each in node.participants:
+        if ParticipantSettings.of(each):
+            yield f"'transport' or 'connections' as declared ({each.reason})"

@@ -7,8 +7,7 @@ nor an event ever sees the handle while it changes. See *Unique Network Flows*
 (rmw_unique_network_flow_endpoints_requirement_t).
 
 An NFE list says which network resources an endpoint may use, not which transport carried a message;
-`dscp` and `flow_label` in it are always 0 with Fast DDS (see `lifecycle.middleware.fastdds.sockets`
-for the value the kernel really uses).
+`dscp` and `flow_label` in it are always 0 with Fast DDS (`sockets` reads what the kernel uses).
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.versions import INSTALL, private
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
@@ -62,9 +61,9 @@ _UNIQUE_PORTS = range(7000, 7400)
 def get_network_flow_endpoints(entity: Publisher | Subscription) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of a publisher or subscription, as rmw lists them.
 
-    With Fast DDS a publisher's are its participant's sender sockets, which are asked for before it
-    has peers (`senders_of`), and a subscription's the locators it listens on, shared memory among
-    them with protocol UNKNOWN and without an address. Empty: not reached over any network.
+    With Fast DDS a publisher's are its participant's sender sockets (`senders_of`), and a
+    subscription's the locators it listens on, shared memory among them with protocol UNKNOWN and
+    without an address.
 
     Raises:
         MiddlewareError: this RMW has no such function, or the installed rcl is not known.
@@ -92,7 +91,7 @@ def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the sender sockets of a node's participant, which all its publishers have.
 
     They are asked for once: do so before it has peers. Fast DDS 2.14 lists them without the lock
-    under which a thread of discovery extends the list for the first peer by shared memory or TCP
+    under which discovery extends the list for the first peer by shared memory or TCP
     (RTPSParticipantImpl::get_sending_locators).
 
     Raises:
@@ -134,11 +133,9 @@ def create_subscription(
 ) -> Subscription:
     """Create a subscription on `node`, with network flow endpoints of its own where asked.
 
-    NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known. The
-    others pass the option to the RMW; STRICTLY_REQUIRED then also demands proof, because some RMWs
-    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399.
-
-    Fast DDS 2.14 gives the port, with its socket and two threads, back only when the participant
+    NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known.
+    STRICTLY_REQUIRED also demands proof, because some RMWs accept the option and ignore it. Fast
+    DDS takes the first free UDP port of 7000–7399, and gives it back only when the participant
     ends: whatever re-creates unique subscriptions does better on a `FlowParticipant`.
 
     Args:
@@ -187,11 +184,9 @@ def create_publisher(
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
     **options: Any,
 ) -> Publisher:
-    """Create a publisher on `node`, on the node's own participant.
+    """Create a publisher on the node's own participant; arguments as `create_subscription`.
 
-    No RMW gives a publisher flow endpoints of its own: all refuse STRICTLY_REQUIRED, or neither
-    check it nor list any, and ignore OPTIONALLY_REQUIRED. A publisher becomes unique on a
-    `FlowParticipant`. Arguments as `create_subscription`.
+    No RMW gives a publisher flow endpoints of its own: it becomes unique on a `FlowParticipant`.
 
     Raises:
         MiddlewareError: STRICTLY_REQUIRED; nothing was made.
@@ -217,10 +212,7 @@ def _not_feasible(
 def _unique_handle(
     node: Node, type_: type[Any], topic: str, *, profile: QoSProfile, unique: UniqueRequirement
 ) -> Iterator[Any]:
-    """Yield rclpy's C++ handle, with the rcl subscription inside made again with the option.
-
-    It is destroyed if the block raises.
-    """
+    """Yield rclpy's C++ handle, with the rcl subscription inside made again with the option."""
     check_is_valid_msg_type(type_)  # also loads the type support
     validate_topic_name(topic)  # names the character at fault, which resolving does not
     resolved = node.resolve_topic_name(topic)  # for messages; unreadable while it is made again
@@ -244,10 +236,7 @@ def _unique_handle(
 def _made_unique(
     handle: Any, node: Node, type_: type[Any], topic: str, unique: UniqueRequirement
 ) -> str:
-    """Make a subscription again with the option; return why the RMW refuses, empty if it does not.
-
-    Where it is strictly required the RMW has to show something for it.
-    """
+    """Make a subscription again with the option; return why that does not do, empty if it does."""
     rcl = abi.load()
     with handle, node.handle:
         owner = node.handle.pointer

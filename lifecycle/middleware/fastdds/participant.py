@@ -1,8 +1,5 @@
 """An extra DDS participant for one network flow or connection: its DSCP, ports and shared memory.
 
-Owns: the hidden node in its own rclpy context that such endpoints live on; its one DSCP, the
-sockets on the ports that its URLs name, and whether it has shared memory.
-
 Fast DDS opens sockets per participant, so a publisher becomes distinguishable on the network by
 getting a participant; see *Unique Network Flows*, "Alternatives". A connection (`connect_to` of
 *Topological Discovery and Communication Negotiation*) is one as well, made from connection URLs.
@@ -26,35 +23,31 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import has_shared_memory
-from lifecycle.middleware.fastdds.static_edp import check_endpoint
+from lifecycle.middleware.fastdds.factory import has_shared_memory
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings, check_endpoint
 from lifecycle.middleware.rcl import abi, hidden_node
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.rcl.hidden_node import quiet_node
-from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
 
 
 @typing.final
 class FlowParticipant:
-    """One participant, one hidden node, and the endpoints that were given to it.
+    """One participant, one hidden node in its own context, and the endpoints that were given to it.
 
-    Nothing but the RMW's own discovery shares its sockets. `destroy` it (or use it in a `with`); it
-    does not end with the node it serves.
+    `destroy` it (or use it in a `with`); it does not end with the node it serves.
 
     Args:
         name: base name of the hidden node; by ROS custom it starts with an underscore.
         namespace: absolute.
         domain_id: 0–232.
         dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
-        served: the node whose executor runs the callbacks of subscriptions, services and clients
-            made here, gated by its callback groups; None leaves them to the executor of `node`.
+        served: the node whose executor runs the callbacks of what is made here, gated by its
+            callback groups; None leaves them to the executor of `node`.
         **settings: of the participant, see ParticipantSettings.
 
     Attributes:
-        name: likewise.
         node: the hidden node.
-        settings: of the participant.
         has_shared_memory: it has that transport.
 
     Raises:
@@ -104,8 +97,8 @@ class FlowParticipant:
     ) -> Publisher:
         """Create a publisher on this participant; `topic` should be fully qualified.
 
-        Its events are handled where the node served is spun, else where `self.node` is; without
-        `event_callbacks` none are set up. Options are those of rclpy's `create_publisher`.
+        Its events are handled where the node served is spun; without `event_callbacks` none are set
+        up. Options are those of rclpy's `create_publisher`.
         """
         self._check_static(type_, topic, writer=True)
         if not options.get("event_callbacks"):
@@ -126,11 +119,7 @@ class FlowParticipant:
         callback_group: CallbackGroup | None = None,
         **options: Any,
     ) -> Subscription:
-        """Create a subscription on this participant; `topic` should be fully qualified.
-
-        Its callback runs in the executor of the node served, else in that of `self.node`. Arguments
-        as `nfe.create_subscription`.
-        """
+        """Create a subscription on this participant; arguments as `nfe.create_subscription`."""
         self._check_static(type_, topic, writer=False)
         if callback_group is None and self._served is not None:
             callback_group = self._served.default_callback_group
@@ -143,7 +132,7 @@ class FlowParticipant:
     def create(
         self, make: Callable[[Node], hidden_node.MovedEndpoint], what: str, name: str
     ) -> Any:
-        """Create an end of a service or action on this participant; spun as a subscription is.
+        """Create an end of a service or action on this participant.
 
         Args:
             make: makes it on a node; its callback group is one of the node served.
@@ -176,13 +165,10 @@ class FlowParticipant:
             self._moved.remove(entity)
 
     def read_dscp(self) -> int:
-        """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
+        """Return the DSCP (0–63) the kernel puts on what this participant sends.
 
-        Of sockets that differ it is one that the participant was not to be marked with: all that
-        it sends must carry the mark, so a single socket without it is what counts.
-
-        Raises:
-            MiddlewareError: it has no socket.
+        Of sockets that differ it is one that the participant was not to be marked with. Raises
+        MiddlewareError if it has no socket.
         """
         found = sockets.get_dscps(self._nfes)
         return min(found - {self._dscp}, default=min(found))
@@ -223,13 +209,10 @@ class FlowParticipant:
 
 
 def _one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
-    """Return the requested DSCP, from whichever source.
+    """Return the requested DSCP, from whichever source; raises MiddlewareError if they differ.
 
-    Fast DDS opens TCP connections whenever it has something to send and lists none of them, so
-    marking them is always too late (ip(7): a connection is marked by its own socket).
-
-    Raises:
-        MiddlewareError: by several, and differently; or for what has no UDP socket.
+    Only UDP can be marked: Fast DDS opens TCP connections whenever it has something to send and
+    lists none of them (ip(7): a connection is marked by its own socket).
     """
     urls = settings.urls
     if dscp is not None and urls and not any(url.transport.is_udp for url in urls):

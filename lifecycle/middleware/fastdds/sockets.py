@@ -1,15 +1,20 @@
-"""Sockets of this process and host: ports of connection URLs, DSCP of participants, buffers.
+"""Sockets of this process and host: ports of connection URLs, DSCP, buffers, TCP connections.
 
-Owns: what a host must have before a participant is made from connection URLs, and what the
-participant's sockets must be afterwards; the DSCP (IP_TOS of ip(7), IPV6_TCLASS of ipv6(7), RFC
-2474) of the sockets that a participant sends from; the receive buffers of those on which it
-receives discovery. Sockets are found among a process's descriptors and in proc(5). Must not import
-rclpy.
+Owns: what a host must have before a participant is made from connection URLs; the DSCP (IP_TOS of
+ip(7), IPV6_TCLASS of ipv6(7), RFC 2474) of the sockets that a participant sends from; the receive
+buffers of those on which it receives discovery; and its TCP connections as the kernel has them
+(TCP_INFO of tcp(7)). Sockets are found among a process's descriptors and in proc(5). Must not
+import rclpy.
 
 Fast DDS says nothing when a fixed port is taken or a whitelist matches nothing: the participant
 receives nothing. It has no DSCP setting; the socket option, which needs no privilege, is what the
 kernel puts into packets. A participant's UDP sender sockets all exist before its first publisher
 does. TCP connections are opened later, are in no NFE list, and are not marked.
+
+Fast DDS 2.14 never returns from the destruction of a participant whose TCP connection is cut, until
+its socket is shut down; and it never uses a connection whose first answer arrived before the
+connecting thread had noted what to request next: only another participant, on another port, helps
+then.
 """
 
 from __future__ import annotations
@@ -25,7 +30,6 @@ from pathlib import Path
 import msgspec
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.dscp import tos
@@ -73,7 +77,9 @@ def sockets_here() -> Iterator[socket.socket]:
 
     What is set on a duplicate is set on the original.
     """
-    for number in socket_descriptors():
+    for number, to in open_files():
+        if not to.startswith("socket:"):
+            continue
         with contextlib.suppress(OSError):  # closed since, or no socket any more
             duplicate = os.dup(number)
             try:
@@ -83,11 +89,6 @@ def sockets_here() -> Iterator[socket.socket]:
                 continue
             with each:
                 yield each
-
-
-def socket_descriptors() -> list[int]:
-    """Return the descriptors of this process that are sockets."""
-    return [number for number, to in open_files() if to.startswith("socket:")]
 
 
 def open_sockets() -> tuple[OpenSocket, ...]:
@@ -120,12 +121,20 @@ def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     return tuple(found)
 
 
-def check_host(urls: Sequence[ConnectionUrl]) -> None:
-    """Refuse URLs whose own address or interface this host has not.
+def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str], ...]:
+    """Return each address of this host, AF_INET or AF_INET6, and the name of its interface."""
+    import psutil  # 15 ms, which few processes need
 
-    Raises:
-        MiddlewareError: names the URL and what there is.
-    """
+    return tuple(
+        (name, each.address.partition("%")[0])
+        for name, addresses in psutil.net_if_addrs().items()
+        for each in addresses
+        if each.family in families
+    )
+
+
+def check_host(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs whose own address or interface this host has not, by MiddlewareError."""
     names = {name for _, name in socket.if_nameindex()}
     addresses = {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
     for url in urls:
@@ -143,13 +152,10 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
 
 
 def check_free(urls: Sequence[ConnectionUrl]) -> None:
-    """Refuse URLs with a port that is taken, before a participant is made of them.
+    """Refuse URLs with a port that is taken, by MiddlewareError; who is leaving is waited for.
 
     Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
-    TCP port, so that must not be found out afterwards. Who is just leaving is waited for.
-
-    Raises:
-        MiddlewareError: names the URL and the port.
+    TCP port, so that must not be found out afterwards.
     """
     for url in urls:
         protocol = "TCP" if url.transport.is_tcp else "UDP"
@@ -170,11 +176,7 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
 
 
 def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
-    """Yield duplicates of this process's sockets that `nfes` names, as `sockets_here` does.
-
-    Raises:
-        MiddlewareError: there is none.
-    """
+    """Yield those of `sockets_here` that `nfes` name; raises MiddlewareError if there is none."""
     wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
     is_found = False
     for each, bound in _bound_here():
@@ -193,8 +195,7 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
 def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
     """Mark every socket of this process that `nfes` names, and read the marks back.
 
-    Everything the participant sends carries the mark, 0–63, its discovery as well. The two ECN bits
-    of the byte stay 0.
+    Everything the participant sends carries the mark, 0–63, its discovery as well.
 
     Raises:
         MiddlewareError: no socket found, or the kernel kept another value.
@@ -204,11 +205,7 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
 
 
 def mark(made: socket.socket, dscp: int) -> None:
-    """Have a socket send with a DSCP, 0–63.
-
-    Raises:
-        MiddlewareError: the kernel does not allow it.
-    """
+    """Have a socket send with a DSCP, 0–63; raises MiddlewareError if the kernel does not."""
     option = DSCP_OPTION[made.family]
     try:
         made.setsockopt(*option, tos(dscp))
@@ -219,23 +216,16 @@ def mark(made: socket.socket, dscp: int) -> None:
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
-    """Return every DSCP that the sockets named by `nfes` send with; one if all are marked alike.
-
-    Raises:
-        MiddlewareError: no socket found.
-    """
+    """Return every DSCP that the sockets named by `nfes` send with, see `own_sockets`."""
     return {each.getsockopt(*DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
 def widen_discovery_buffers(domain_id: int) -> int:
     """Give the sockets on which this process receives discovery room for many participants.
 
-    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: a quarter
-    of what twenty participants announce. Data keep their buffers: what waits in a large one is
-    late. The kernel gives no more than twice net.core.rmem_max (socket(7)).
-
-    Returns:
-        How many sockets have more room than before.
+    Fast DDS 2.14 leaves them the system's default, which holds a quarter of what twenty
+    participants announce. Data keep their buffers: what waits in a large one is late. Returns how
+    many have more room than before.
     """
     first = participant_ports(domain_id, 0).discovery_multicast
     ports = range(first, first + DG, 2)
@@ -278,11 +268,7 @@ def _is_free(kind: Medium, address: str, port: int) -> bool:
 
 
 def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
-    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex.
-
-    Raises:
-        OSError: there is no such table.
-    """
+    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         fields = line.split()
         written, _, port = fields[1].partition(":")
@@ -292,3 +278,90 @@ def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
         if number := int(port, 16):
             inode = int(fields[9])
             yield OpenSocket(inode=inode, kind=kind, address=address, port=number), fields[3]
+
+
+_UNANSWERED = 2
+"""Retransmissions in a row after which a connection is dead for a leaving process."""
+
+_SYN_SENT = 2  # tcp_states.h
+_ESTABLISHED = 1
+_STATE, _RETRANSMITS, _PROBES = 0, 2, 3  # offsets in struct tcp_info
+_LAST_RECEIVED_MS, _BYTES_ACKED, _BYTES_RECEIVED = 52, 120, 128
+
+_FIRST_REQUEST = 100
+"""Bytes; the request by which Fast DDS begins has 68, and the next one 38 more."""
+
+_IDLE_MS = 500
+"""A connection in use says what it wants next within 0.1 s of the first answer."""
+
+
+def give_up_dead_connections() -> int:
+    """Shut down every TCP connection of this process that is not answered; return how many.
+
+    For a process that is about to end: an accepted connection that is shut down is not made again.
+    """
+    count = 0
+    for each in _connections():
+        with contextlib.suppress(OSError):  # closed since
+            if _is_dead(each):
+                each.shutdown(socket.SHUT_RDWR)
+                count += 1
+    return count
+
+
+def _connections() -> Iterator[socket.socket]:
+    for each in sockets_here():
+        if each.type == socket.SOCK_STREAM and each.family in (socket.AF_INET, socket.AF_INET6):
+            yield each
+
+
+def is_used(address: str, port: int) -> bool | None:
+    """Return whether the connection that this process dialled there is used by Fast DDS.
+
+    None while that is open: there is no connection yet, or it has only just begun.
+    """
+    for each in _connections():
+        with contextlib.suppress(OSError):  # not connected yet
+            if each.getpeername() == (address, port):
+                return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
+    return None
+
+
+def _is_used(info: bytes) -> bool | None:
+    (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
+    acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
+    if acked >= _FIRST_REQUEST:
+        return True
+    return False if received and idle_ms >= _IDLE_MS else None
+
+
+def _is_dead(each: socket.socket) -> bool:
+    info = each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 8)
+    if info[_STATE] == _SYN_SENT:
+        return True
+    return info[_STATE] == _ESTABLISHED and max(info[_RETRANSMITS], info[_PROBES]) >= _UNANSWERED
+
+
+AT_MOST_S = 1.0
+"""The least that Linux allows. By default the time doubles up to 120 s (RFC 6298 §5.5), so that
+after an outage nothing passes for about as long again."""
+
+_GIVES_UP_S = 924
+"""As long as Linux tries by default (tcp_retries2 of tcp(7)): it counts how often it sent again,
+and would give up after 15 s. Fast DDS 2.14 does not get over a connection that was given up."""
+
+_TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
+
+
+def send_again_soon() -> int:
+    """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
+
+    Returns how many heed it: 0 before Linux 6.15, which has no such option.
+    """
+    count = 0
+    for each in _connections():
+        with contextlib.suppress(OSError):  # closed since, or a kernel without the option
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
+            each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))
+            count += 1
+    return count

@@ -1,8 +1,7 @@
 """Transports of a participant in its Fast DDS profile, with their locators and discovery.
 
-Owns: the grouping of connection URLs into Fast DDS transports; the XML of transports, of where data
-and discovery arrive and discovery is sent to, and of discovery servers. Must not import rclpy;
-reads no environment.
+Owns: the grouping of connection URLs into Fast DDS transports, and the XML of profiles' elements.
+Must not import rclpy; reads no environment.
 
 Two URLs of one family (IPv4 UDP and a group over IPv4) share one transport: with two of a kind Fast
 DDS would send everything twice.
@@ -18,7 +17,6 @@ from xml.etree import ElementTree as ET
 import msgspec
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.profiles import child, drop, put
 from lifecycle.middleware.versions import installed
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
 from lifecycle.network.medium import Medium
@@ -290,3 +288,22 @@ def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
             # A server's logical port is its physical one.
             physical = server.port if url.transport.is_tcp else None
             _locate(listened, url.family, server.address, port=server.port, physical=physical)
+
+
+def child(parent: ET.Element, tag: str) -> ET.Element:
+    """Return the first child of this name; made if there is none."""
+    found = parent.find(tag)
+    return ET.SubElement(parent, tag) if found is None else found
+
+
+def drop(parent: ET.Element, *tags: str) -> None:
+    """Remove the children of these names."""
+    for each in [each for each in parent if each.tag in tags]:
+        parent.remove(each)
+
+
+def put(parent: ET.Element, path: str, content: object) -> None:
+    """Set the text of an element by its path; the ones on the way are made if there are none."""
+    for tag in path.split("/"):
+        parent = child(parent, tag)
+    parent.text = str(content)

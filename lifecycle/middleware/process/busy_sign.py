@@ -1,9 +1,8 @@
 """Hang detection between two processes: a page that one writes when it is busy and the other reads.
 
-Owns: the page of memory that the two processes share, and when the watcher looks at it. The busy
-one writes the time into the page. The watcher looks once per limit, and when something that it saw
-may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor SIGSTOP keeps
-it from noticing then. Must not import rclpy.
+The busy one writes the time into the page. The watcher looks once per limit, and when something
+that it saw may be over its limit: neither the lock of an interpreter, nor a blocked thread, nor
+SIGSTOP keeps it from noticing then. Must not import rclpy.
 
 Time during which the thread could have run and got no processor is not its own. The kernel counts
 it for each thread (run_delay of /proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up
@@ -11,21 +10,26 @@ to its last turn. One that is ready to run hangs once it has run for long beyond
 once the limit has passed without what it waited for a processor.
 
 The page has room for what the busy one does, in words, and the file behind it for where its threads
-stand (stacks.py).
+stand: asked by a signal, faulthandler writes it there from C, so that code which never gives up the
+interpreter's lock is seen as well.
 """
 
 from __future__ import annotations
 
+import contextlib
 import enum
+import faulthandler
 import mmap
 import os
+import re
+import signal
+import sysconfig
 import threading
 import time
 import typing
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process import stacks
 
 _PAGE_BYTES = mmap.PAGESIZE
 _SINCE, _LIMIT, _THREAD, _ANSWERS = range(4)
@@ -58,10 +62,7 @@ class _Turns(typing.NamedTuple):
 
 @typing.final
 class BusySign:
-    """Shared by one thread that is busy or idle and one process that watches it; `close` it.
-
-    Both sides read CLOCK_MONOTONIC, so they must be on one host.
-    """
+    """Shared by one thread that is busy or idle and one process of this host that watches it."""
 
     def __init__(self, page: int) -> None:
         self._page = page
@@ -75,11 +76,7 @@ class BusySign:
 
     @classmethod
     def make(cls, limit_s: float) -> BusySign:
-        """Make a sign whose holder may be busy for `limit_s` seconds, > 0, at a time.
-
-        Raises:
-            MiddlewareError: the kernel refused.
-        """
+        """Make a sign whose holder may be busy for `limit_s` seconds, > 0, at a time."""
         try:
             page = os.memfd_create("lifecycle-busy", os.MFD_CLOEXEC)
             os.ftruncate(page, _PAGE_BYTES)
@@ -107,7 +104,7 @@ class BusySign:
 
     def show_stacks(self) -> None:
         """Have this process show where it stands, see `where`."""
-        self._words[_ANSWERS] = stacks.answer(self._page)
+        self._words[_ANSWERS] = _show_stacks(self._page)
 
     def begin(self, after_s: float = 0.0, what: str = "") -> None:
         """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before."""
@@ -153,10 +150,7 @@ class BusySign:
         return why if why is not said else None, (limit - own if part < own < limit else part) / _NS
 
     def _own_ns(self, since: int, now: int, turns: _Turns | None) -> int:
-        """Return for how much of the time since then the holder ran, or waited for something else.
-
-        It is at most the truth: so a hang on an overloaded machine is noticed later.
-        """
+        """Return for how much of the time since then it ran, or waited for something else."""
         if turns is None:  # a kernel that does not count: all of the time is its own
             return now - since
         if self._overdue is None or self._overdue.thread != turns.thread:
@@ -183,18 +177,12 @@ class BusySign:
         return text.partition(b"\0")[0].decode(errors="replace")
 
     def where(self, pid: int) -> str:
-        """Return where the threads of the holder stand, as faulthandler writes it.
+        """Return where the threads of the holder stand, as faulthandler writes it, within 0.25 s.
 
-        Waits for up to a quarter of a second.
-
-        Args:
-            pid: of the holder.
-
-        Returns:
-            Empty if it does not answer: it was stopped, or is not one of ours.
+        Empty if it does not answer: it was stopped, or is not one of ours.
         """
         answers = pid > 0 and self._words[_ANSWERS]
-        return stacks.ask(pid, self._page, _PAGE_BYTES) if answers else ""
+        return _stacks_of(pid, self._page, _PAGE_BYTES) if answers else ""
 
     def close(self) -> None:
         """Close this side; again is harmless."""
@@ -224,3 +212,96 @@ def _turns_of(thread: int, now: int) -> _Turns | None:
     if not ran:
         return None
     return _Turns(thread=thread, at_ns=now, ran_ns=ran, waited_ns=waited, ready=state == b"R")
+
+
+_SIGNAL = signal.SIGRTMAX - 3
+"""Programs do not use it; only who shows its stacks is sent it."""
+
+_WITHIN_S = 0.25
+_STILL_S = 0.01
+"""An answer is complete once nothing came for so long: it is written within a millisecond."""
+
+_MOST_BYTES = 1 << 16
+_FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
+_SHOWN = 3
+
+_PACKAGE = f"{Path(__file__).parents[2]}{os.sep}"
+_HOST = f"{_PACKAGE}node{os.sep}host{os.sep}"
+_STDLIB = f"{sysconfig.get_path('stdlib')}{os.sep}"
+_PACKAGES = ("site-packages", "dist-packages")
+
+
+def _show_stacks(descriptor: int) -> bool:
+    """Have this process append its stacks to a file whenever it is asked; whether that works.
+
+    The caller's thread, and those that begin after this, do not take the signal: what waits in one
+    of them is not interrupted. One thread has to call `show_stacks_here`.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {_SIGNAL})
+    try:
+        # Of its own offset, and at the end wherever the file is cut.
+        file = os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        faulthandler.register(_SIGNAL, file=file, all_threads=True)
+    except (OSError, RuntimeError, ValueError):
+        return False
+    return True
+
+
+def show_stacks_here() -> None:
+    """Take the signal in this thread; it must not mind being interrupted."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {_SIGNAL})
+
+
+def _stacks_of(pid: int, descriptor: int, keep_bytes: int) -> str:
+    """Return the stacks of a process that answers into a file, behind what it keeps there."""
+    try:
+        os.ftruncate(descriptor, keep_bytes)
+        os.kill(pid, _SIGNAL)
+    except OSError:
+        return ""
+    began = grown = time.monotonic()
+    size = keep_bytes
+    while (now := time.monotonic()) - began < _WITHIN_S:
+        if (more := os.fstat(descriptor).st_size) != size:
+            size, grown = more, now
+        elif size > keep_bytes and now - grown >= _STILL_S:
+            break
+        time.sleep(0.001)
+    return os.pread(descriptor, _MOST_BYTES, keep_bytes).decode(errors="replace")
+
+
+def brief(stacks: str) -> str:
+    """Return where the code of a callback stands; empty where no thread is in one.
+
+    The function that was called back, and the last ones that it called: `hear (robot.py:12) > read
+    (robot.py:40)`. What belongs to our executor, rclpy or Python is left out.
+    """
+    found = []
+    for thread in re.split(r"\n\n|(?=Current thread|Thread 0x)", stacks):
+        frames = [match.groups() for match in map(_FRAME.match, thread.splitlines()) if match]
+        # What a host was forked from is below it, a command line with its libraries.
+        hosts = [index for index, (file, *_) in enumerate(frames) if file.startswith(_HOST)]
+        frames = frames[: hosts[0] + 1] if hosts else frames
+        users = [index for index, (file, *_) in enumerate(frames) if _is_users(file)]
+        if not users or not any(_is_executor(file) for file, *_ in frames[users[-1] + 1 :]):
+            continue
+        chosen = [*users[: _SHOWN - 1], users[-1]] if len(users) > _SHOWN else users
+        shown = [frames[index] for index in dict.fromkeys(reversed(chosen))]
+        found.append(" > ".join(f"{name} ({_short(file)}:{line})" for file, line, name in shown))
+    return "; ".join(dict.fromkeys(found[:2]))
+
+
+def _is_executor(file: str) -> bool:
+    return file.startswith(_PACKAGE) or "/rclpy/" in file
+
+
+def _is_users(file: str) -> bool:
+    if file.startswith("<") or _is_executor(file):
+        return False
+    return not file.startswith(_STDLIB) or any(each in file for each in _PACKAGES)
+
+
+def _short(file: str) -> str:
+    with contextlib.suppress(ValueError, OSError):
+        return str(Path(file).relative_to(Path.cwd()))
+    return file

@@ -1,7 +1,7 @@
 """How the processes that run were started: command line, folder and environment (/proc, proc(5)).
 
 Owns: which process of this host a participant belongs to, by its GUID prefix; and which of its
-environment variables matter to who starts it again. Reads /proc, and runs nothing.
+environment variables matter to who starts it again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from lifecycle.export.programs import CapturedProgram
-from lifecycle.middleware.discovery.prefixes import is_of_process
+from lifecycle.middleware.process.prefixes import is_of_process
 from lifecycle.plan.secrets import shown
 
 _LONGEST_VALUE = 8192
@@ -58,12 +58,7 @@ def programs_of(
 
 
 def read_program(pid: int, environment: Mapping[str, str]) -> CapturedProgram | None:
-    """Return how a process was started; None where that cannot be read or written down.
-
-    Args:
-        pid: of a process on this host.
-        environment: variables that differ from these are reported.
-    """
+    """Return how a process was started; None where that cannot be read or written down."""
     folder = Path(f"/proc/{pid}")
     try:
         words = (folder / "cmdline").read_bytes().split(b"\0")[:-1]

@@ -1,7 +1,7 @@
 """Shared memory files of Fast DDS in /dev/shm: how much room there is, and removing what is unused.
 
-Owns: which of them are in use, and removing what a killed process left: one segment of some 540 kB
-per participant and the files of its ports, which Fast DDS never reclaims. Must not import rclpy.
+A killed process leaves a segment of some 540 kB per participant and the files of its ports, which
+Fast DDS never reclaims. Must not import rclpy.
 
 A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>` (`fastdds_` with Fast DDS
 3), each with a lock file (`_el` exclusive, `_sl` shared) that the owner keeps locked (flock(2)); a
@@ -39,7 +39,7 @@ _LEAST_ROOM_BYTES = 1 << 15
 
 
 def holds_shared_memory() -> bool:
-    """Return whether this process has files of Fast DDS in /dev/shm mapped or open, with a name.
+    """Return whether this process has named files of Fast DDS in /dev/shm mapped or open.
 
     Fast DDS removes these when it is unloaded; a process that ends before that leaves them.
     """
@@ -65,11 +65,7 @@ def own_segments() -> frozenset[str]:
 
 
 def check_room() -> None:
-    """Make sure that there is some room in /dev/shm, before a library of ROS 2 is loaded.
-
-    Raises:
-        MiddlewareError: there is so little that the kernel would end this process with SIGBUS.
-    """
+    """Make sure that the kernel would not end this process by SIGBUS when ROS 2 is loaded."""
     with contextlib.suppress(OSError):
         there = os.statvfs(_DIRECTORY)
         if (free := there.f_bavail * there.f_frsize) < _LEAST_ROOM_BYTES:
@@ -82,15 +78,12 @@ def check_room() -> None:
 
 
 def sweep(*, within_s: float = 0.0) -> tuple[str, ...]:
-    """Remove the files of this user that no process uses.
+    """Remove the files of this user that no process uses, and return their names, sorted.
 
     What was made just now is left: its owner may not have locked it yet.
 
     Args:
         within_s: seconds to try again while others still use what no process owns.
-
-    Returns:
-        The names removed, sorted; empty where there is no /dev/shm.
     """
     deadline = time.monotonic() + within_s
     removed: tuple[str, ...] = ()

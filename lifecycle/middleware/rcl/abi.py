@@ -4,7 +4,7 @@ Owns: the struct layouts, the function signatures, and the check that the loaded
 ones these layouts were written for. Layouts are those of rcl 9 (ROS 2 Jazzy) and 10 (Kilted), both
 with rmw 7, on any 64-bit Linux; headers rcl/{publisher,subscription,wait,guard_condition}.h,
 rmw/{types,network_flow_endpoint}.h, rcutils/{allocator,error_handling}.h. With other libraries
-nothing is called: `refusal` says why, and what can be had from rclpy is taken from there.
+nothing is called: `refusal` says why.
 """
 
 from __future__ import annotations
@@ -137,12 +137,7 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 class Rcl:
-    """The loaded libraries; get it from `load`.
-
-    Attributes:
-        call: their functions, by name. They release the GIL while they run, as ctypes.CDLL does.
-        default_allocator: rcutils_get_default_allocator's.
-    """
+    """The loaded libraries by name; they release the GIL while they run. Get it from `load`."""
 
     def __init__(self) -> None:
         version = rcl_version()
@@ -159,12 +154,7 @@ class Rcl:
         return _ERROR_LOCATION.sub("", text).strip() or "no reason given"
 
     def flow_endpoints(self, kind: str, entity: int) -> tuple[int, list[Nfe]]:
-        """Return the code of rcl and the NFEs of a publisher or subscription, copied.
-
-        Args:
-            kind: "publisher" or "subscription".
-            entity: address of its rcl struct.
-        """
+        """Return the code of rcl and the NFEs of a "publisher" or "subscription"."""
         array = NfeArray()
         get = self.call[f"rcl_{kind}_get_network_flow_endpoints"]
         code = get(entity, ctypes.byref(self.default_allocator), ctypes.byref(array))
@@ -229,12 +219,8 @@ class Rcl:
 class GuardWait:
     """Waits for guard conditions of one context; `close` it after the last `wait` has returned.
 
-    Args:
-        context: address of the rcl_context_t.
-        count: how many guard conditions there are.
-
     Raises:
-        MiddlewareError: rcl refuses.
+        MiddlewareError: rcl refuses, also to wait.
     """
 
     def __init__(self, context: int, count: int) -> None:
@@ -246,15 +232,7 @@ class GuardWait:
         self._check(self._call["rcl_wait_set_init"](at, *sizes, context, allocator))
 
     def wait(self, guards: Sequence[int], timeout_s: float | None) -> bool:
-        """Return whether one of the guard conditions was triggered in time.
-
-        Args:
-            guards: addresses of rcl_guard_condition_t; what they belong to must stay.
-            timeout_s: None for ever.
-
-        Raises:
-            MiddlewareError: rcl cannot wait.
-        """
+        """Return whether one of the guard conditions was triggered in time, None for ever."""
         wait_set = ctypes.byref(self._set)
         self._check(self._call["rcl_wait_set_clear"](wait_set))
         for each in guards:
@@ -276,11 +254,7 @@ class GuardWait:
 
 
 def load() -> Rcl:
-    """Load and check the libraries once.
-
-    Raises:
-        MiddlewareError: a library or symbol is missing, or is laid out otherwise.
-    """
+    """Load and check the libraries once; raises MiddlewareError where they are not as known."""
     loaded = _loaded()
     if isinstance(loaded, MiddlewareError):
         raise MiddlewareError(loaded.message, hint=loaded.hint)
@@ -312,10 +286,7 @@ def _asserting() -> Any:
 
 
 def type_support(message_type: object) -> int:
-    """Return the address of a message class's rosidl_message_type_support_t.
-
-    rclpy must have used the class before: that is when its type support is loaded.
-    """
+    """Return the address of a message class's rosidl_message_type_support_t, once rclpy used it."""
     capsule = private(type(message_type), "_TYPE_SUPPORT", f"read the type of {message_type!r}")
     name = ctypes.pythonapi.PyCapsule_GetName
     name.restype, name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
@@ -326,11 +297,6 @@ def type_support(message_type: object) -> int:
 
 def bind(symbol: str, result: Any, arguments: Sequence[Any]) -> Any:
     """Return a function of the library that its name begins with: rcl, rmw or rcutils.
-
-    Args:
-        symbol: its C name.
-        result: ctypes type.
-        arguments: ctypes types.
 
     Raises:
         MiddlewareError: there is none.

@@ -10,14 +10,13 @@ left.
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import os
 import threading
 import time
 import typing
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import rclpy
@@ -27,29 +26,34 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.environment import is_served, reach, settle_s
-from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
-from lifecycle.middleware.discovery.prober import Settling
-from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.profiles import DISCOVERY_SERVER_VARIABLE, FORGOTTEN_S
-from lifecycle.middleware.fastdds.settings import observer_settings
-from lifecycle.middleware.process.hosted import is_vouched_for
+from lifecycle.middleware.fastdds.discovery import is_served, reach, settle_s
+from lifecycle.middleware.fastdds.factory import observer_settings
+from lifecycle.middleware.fastdds.prober import Settling
+from lifecycle.middleware.fastdds.profiles import (
+    DISCOVERY_SERVER_VARIABLE,
+    FORGOTTEN_S,
+    ParticipantSettings,
+)
+from lifecycle.middleware.fastdds.sockets import give_up_dead_connections, is_used
+from lifecycle.middleware.process.prefixes import (
+    PROCESS_DIGITS,
+    is_of_host,
+    is_of_process,
+    is_vouched_for,
+)
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import (
+    OF_SERVICES,
     OVER_DDS,
     RAW,
-    Ends,
+    endpoints_in,
     endpoints_of,
     endpoints_of_node,
-    node_names,
     rmw_topics,
-    service_ends,
-    service_hash,
-    services_in,
-    topic_endpoints,
+    services_of_node,
     topic_names,
     unreadable,
+    with_reply,
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.plan.model import ParticipantConnections
@@ -68,8 +72,6 @@ if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
 
 _PARAMETER_EVENTS = "/parameter_events"
 """rclcpp and rclpy give every node one publisher of it."""
-
-_OF_SERVICES = (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT)
 
 _AGREED_S = 5.0
 """A server that listens agrees within so long, on a busy machine too."""
@@ -168,8 +170,7 @@ class GraphObserver:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
         All but its own node, of which there is only what has one of these `names`. The
-        housekeeping of client libraries is left out. Services are known by their nodes, so those
-        of no known node are looked for by name.
+        housekeeping of client libraries is left out.
 
         Args:
             names: of topics, services and actions that are looked for: a node that offers one of
@@ -187,15 +188,14 @@ class GraphObserver:
             return self._look(names)
 
     def _look(self, names: DeclaredNames) -> Snapshot:
-        wanted = (_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER))
-        topics, illegible = topic_names(self.node, self._topics_before | rmw_topics(wanted))
+        topics, illegible = topic_names(self.node, self._topics_before | _declared_topics(names))
         shown: dict[str, list[ObservedEndpoint]] = {}
         if illegible:
             shown[""] = [unreadable(EndpointKind.PUBLISHER, illegible)]
         else:
             self._topics_before = frozenset(topics)
         homes: dict[str, Counter[str]] = {}
-        for each in topic_endpoints(self.node, topics):
+        for each in endpoints_in(self.node, topics):
             if self._is_dead(each):
                 continue
             if each.node:
@@ -203,30 +203,24 @@ class GraphObserver:
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
             # Of plain DDS programs only what has the names of ROS concerns a system of ROS.
             raw = each.name.startswith(RAW)
-            if each.node if raw else names.keeps(each, each.node, ours=False):
+            is_kept = each.node if raw else names.keeps(each, each.node, ours=False)
+            if is_kept or each.kind in OF_SERVICES:
                 shown.setdefault(each.node, []).append(self._timed(each))
+        for name in () if OVER_DDS else homes:
+            shown.setdefault(name, []).extend(services_of_node(self.node, name))
         named = frozenset(itertools.chain.from_iterable(homes.values()))
         self.settling.saw(named, next(iter(homes.get(self._name, ())), ""))
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
-        ourselves = self._name if self.owns_node and counts.get(self._name) == 1 else None
-        services, are_all = self._services_by_node(counts, ourselves)
-        if ourselves is not None:
+        if self.owns_node and counts.get(self._name) == 1:
             # Others match what a supervisor offers under names that are looked for, and measures.
-            del counts[ourselves]
-            own = shown.pop(ourselves, [])
-            shown[ourselves] = [
+            del counts[self._name]
+            shown[self._name] = [
                 each
-                for each in own
-                if names.looks_for(each.kind, each.name) or names.has(each.kind, each.name)
+                for each in shown.pop(self._name, ())
+                if each.kind not in OF_SERVICES
+                and (names.looks_for(each.kind, each.name) or names.has(each.kind, each.name))
             ]
-        ends = functools.cache(functools.partial(service_ends, self.node))
-        sought = _declared_services(names) | (set() if are_all else services_in(topics))
-        others = self._services_by_name(sought, services, ends)
-        for each in itertools.chain(*services.values(), others):
-            shown.setdefault(each.node, []).append(each)
-            if each.node:
-                counts.setdefault(each.node, 1)
         nodes = (
             ObservedNode(full_name=name, count=count, managed=_managed(name, shown.get(name, ())))
             for name, count in sorted(counts.items())
@@ -240,7 +234,7 @@ class GraphObserver:
                 for each in shown[name]
                 if names.keeps(each, each.node, ours=each.node in self._ours)
             )
-            folded = fold_actions(self._hashed(name, judged, ends))
+            folded = fold_actions(self._hashed(judged))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
 
@@ -413,70 +407,16 @@ class GraphObserver:
             return replace(endpoint, silent=True)
         return endpoint
 
-    def _services_by_node(
-        self, counts: Mapping[str, int], ourselves: str | None
-    ) -> tuple[dict[str, list[ObservedEndpoint]], bool]:
-        """Return the services and clients that rcl lists of each node, and whether that is all.
-
-        It lists none of a node whose name it would not give, and of several of one name those of
-        the first, which may have left.
-        """
-        listed: dict[str, list[ObservedEndpoint]] = {}
-        are_all = True
-        named = Counter(node_names(self.node))
-        for name in counts.keys() | named.keys():
-            found = [(kind, endpoints_of_node(self.node, kind, name)) for kind in _OF_SERVICES]
-            if name == ourselves:
-                listed[name] = []
-            elif named[name] <= counts.get(name, 0) and None not in (each for _, each in found):
-                listed[name] = [
-                    ObservedEndpoint(kind=kind, node=name, name=service, type=type_)
-                    for kind, each in found
-                    for service, type_ in each or ()
-                ]
-            elif name in counts or any(each != () for _, each in found):
-                are_all = False
-        return listed, are_all
-
-    def _services_by_name(
-        self, names: Iterable[str], listed: Collection[str], ends: Callable[..., Ends]
-    ) -> Iterator[ObservedEndpoint]:
-        """Yield the endpoints of services on nodes of which rcl lists none.
-
-        A node that is about to be known has them too; a plain DDS program never is one.
-        """
-        for name, kind in itertools.product(sorted(names), _OF_SERVICES):
-            shown: set[str] = set()
-            for each in itertools.chain(*ends(kind, name)):
-                owner = each.node or each.gid[:PREFIX_DIGITS]
-                if each.node not in listed and owner not in shown and not self._is_dead(each):
-                    shown.add(owner)
-                    gid = "" if each.node else each.gid
-                    yield replace(each, qos=None, type_hash=None, gid=gid)
-
-    def _hashed(
-        self, name: str, endpoints: Iterable[ObservedEndpoint], ends: Callable[..., Ends]
-    ) -> Iterator[ObservedEndpoint]:
-        """Yield one node's endpoints, its services with their hashes and its servers with GIDs.
-
-        Their requests and replies are DDS topics, whose endpoints announce the hashes. A client has
-        no GID: whoever asks may ask with several.
-        """
+    def _hashed(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
+        """Yield one node's endpoints, its services with their hashes."""
+        requests: dict[tuple[EndpointKind, str, str], list[ObservedEndpoint]] = {}
         for each in endpoints:
-            if each.kind not in _OF_SERVICES:
+            if OVER_DDS and each.kind in OF_SERVICES:
+                requests.setdefault((each.kind, each.name, each.type), []).append(each)
+            else:
                 yield each
-                continue
-            both = ends(each.kind, each.name)
-            gids = {each.gid}
-            if not each.gid and each.kind is EndpointKind.SERVICE_SERVER:
-                gids = {
-                    end.gid
-                    for end in both[0]
-                    if (end.node, end.type) == (name, each.type) and not self._is_dead(end)
-                } or {""}
-            type_hash = service_hash(both, name)
-            for gid in sorted(gids):
-                yield replace(each, type_hash=type_hash, gid=gid)
+        for found in requests.values():
+            yield from with_reply(self.node, found)
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
         """Add their participants' addresses to endpoints of no known node.
@@ -518,16 +458,18 @@ def _as_super_client() -> Iterator[None]:
         del os.environ[_SUPER_CLIENT_VARIABLE]
 
 
-def _declared_services(names: DeclaredNames) -> set[str]:
-    """Return the names of all services that are looked for, those of actions included."""
-    return {
+def _declared_topics(names: DeclaredNames) -> set[str]:
+    """Return what the RMW calls the topics and services that are looked for."""
+    services = {
         *names.of_kind(EndpointKind.SERVICE_SERVER),
         *(
             f"{action}/_action/{part}"
             for action in names.of_kind(EndpointKind.ACTION_SERVER)
             for part in ("send_goal", "cancel_goal", "get_result")
         ),
+        *(f"{node}/{base}" for node in names.nodes for base in ("change_state", "get_state")),
     }
+    return rmw_topics((_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER)), services)
 
 
 def _managed(node: str, endpoints: Iterable[ObservedEndpoint]) -> bool:

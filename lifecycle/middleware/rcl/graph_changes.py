@@ -1,8 +1,7 @@
 """Graph changes without polling: rcl's guard condition, and whether a client's server is matched.
 
 Owns: the thread of each participant that sleeps on rcl's graph guard condition, which rclpy does
-not expose, while anybody follows the graph. Where the installed rcl is not one whose layouts are
-known, it compares what rclpy shows twice a second.
+not expose, while anybody follows the graph.
 
 rmw_fastrtps counts a client's server only while both its ends are matched, and as many as the graph
 knows of (rmw_service_server_is_available.cpp, rcl_action_server_is_available).
@@ -40,16 +39,17 @@ _logger = logging.getLogger(__name__)
 _SOON_S, _AGAIN_S = 0.002, 0.2
 """Pauses, ever longer, while a callback says that what it waits for may follow a change: discovery
 shows an endpoint a moment before it is matched, and no event reports the match."""
-_COMPARE_S = 0.5
+_UNKNOWN_S = 0.5
+"""An rcl whose layouts are not known gives no event: the graph may have changed after so long."""
 _GONE = (InvalidHandle, ValueError, rclpy_implementation.RCLError)
 """What rclpy raises of what was destroyed meanwhile, and where a name cannot be had."""
 
 
 @typing.final
 class GraphGuard:
-    """Calls back whenever discovery changes the graph that a participant sees; get it by `of`.
+    """Calls back when discovery changes the graph that a participant sees; get it by `of`.
 
-    Changes that happen during callbacks are folded into one further call.
+    Changes during callbacks are folded into one further call.
 
     Attributes:
         failure: why the thread gave up; None while it works.
@@ -59,7 +59,7 @@ class GraphGuard:
         self.failure: MiddlewareError | None = None
         self._lock = threading.Lock()
         self._callbacks: dict[object, tuple[Node, Callback]] = {}
-        self._watch: _Comparison | None = None
+        self._watch: _Watch | None = None
 
     @classmethod
     def of(cls, node: Node) -> GraphGuard:
@@ -80,8 +80,7 @@ class GraphGuard:
                 True it is called again without a change, at last each 0.2 s.
 
         Returns:
-            A function that takes the callback away again; not to be called by a callback. One that
-            is being called meanwhile may return later.
+            A function that takes the callback away again; not to be called by a callback.
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
@@ -111,7 +110,7 @@ class GraphGuard:
                 self.notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
-        watch = _Comparison(node) if abi.refusal() else _Guarded(node)
+        watch = _Watch(node)
         self._watch, self.failure = watch, None
         watch.thread = threading.Thread(
             target=self._run, args=[watch], name="graph-guard", daemon=True
@@ -124,7 +123,7 @@ class GraphGuard:
             self._watch.thread.join()
             self._watch = None
 
-    def _run(self, watch: _Comparison) -> None:
+    def _run(self, watch: _Watch) -> None:
         try:
             watch.run(self.notify)
         except MiddlewareError as error:
@@ -157,83 +156,49 @@ def _let_go() -> None:
         guard.close()
 
 
-class _Comparison:
-    """Reads the graph that a node sees twice a second, in `thread`, until it is stopped."""
+class _Watch:
+    """Waits in `thread` for changes of the graph that a node sees, until it is stopped."""
 
     def __init__(self, node: Node) -> None:
         self.node = node
         self.thread: threading.Thread
         self._stopped = threading.Event()
-        self._last: object = None
+        self._guards: abi.GuardWait | None = None
+        if not abi.refusal():
+            self._graph = abi.load().call["rcl_node_get_graph_guard_condition"](node.handle.pointer)
+            self._wake = GuardCondition(None, None, context=node.context)
+            self._guards = abi.GuardWait(node.context.handle.pointer, 2)
 
     def run(self, notify: Callable[[], bool]) -> None:
         """Call `notify` after each change, and while it returns True after ever longer pauses."""
+        if self._guards is None:
+            while not self._stopped.wait(_UNKNOWN_S):
+                notify()
+            return
         pause_s: float | None = None
-        while (changed := self._wait(pause_s)) is not None:
-            if not notify():
-                pause_s = None
-            elif changed or pause_s is None:
-                pause_s = _SOON_S
-            else:
-                pause_s = min(2 * pause_s, _AGAIN_S)
-
-    def stop(self) -> None:
-        """Have it end, now or later."""
-        self._stopped.set()
-
-    def _wait(self, pause_s: float | None) -> bool | None:
-        """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
-        while not self._stopped.wait(_COMPARE_S if pause_s is None else pause_s):
-            found = self._read()
-            changed, self._last = found != self._last, found
-            if changed or pause_s is not None:
-                return changed
-        return None
-
-    def _read(self) -> object:
-        """Return what differs when the graph has changed; None where that cannot be read."""
-        node = self.node
         try:
-            listed = sorted(node.get_topic_names_and_types(no_demangle=True))
-            queries = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
-            gids = {
-                tuple(info.endpoint_gid)
-                for name, _ in listed
-                for query in queries
-                for info in query(name, no_mangle=True)
-            }
-            return listed, gids, sorted(node.get_node_names_and_namespaces())
-        except _GONE:
-            return None
-
-
-class _Guarded(_Comparison):
-    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(node)
-        graph_guard = abi.load().call["rcl_node_get_graph_guard_condition"]
-        self._graph = graph_guard(node.handle.pointer)
-        self._wake = GuardCondition(None, None, context=node.context)
-        self._guards = abi.GuardWait(node.context.handle.pointer, 2)
-
-    def run(self, notify: Callable[[], bool]) -> None:
-        """As without a guard condition, while rclpy frees nothing of what is waited for."""
-        try:
+            # Meanwhile rclpy frees nothing of what is waited for.
             with self.node.context.handle, self.node.handle, self._wake.handle:
-                super().run(notify)
+                while True:
+                    guards = self._graph, self._wake.handle.pointer
+                    changed = self._guards.wait(guards, pause_s)
+                    if self._stopped.is_set():
+                        return
+                    if not notify():
+                        pause_s = None
+                    elif changed or pause_s is None:
+                        pause_s = _SOON_S
+                    else:
+                        pause_s = min(2 * pause_s, _AGAIN_S)
         finally:
             self._guards.close()
             self._wake.destroy()
 
     def stop(self) -> None:
         """Have it end, now or later."""
-        super().stop()
-        self._wake.trigger()
-
-    def _wait(self, pause_s: float | None) -> bool | None:
-        triggered = self._guards.wait((self._graph, self._wake.handle.pointer), pause_s)
-        return None if self._stopped.is_set() else triggered
+        self._stopped.set()
+        if self._guards is not None:
+            self._wake.trigger()
 
 
 _COUNTING_BOTH_WAYS = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
@@ -249,14 +214,13 @@ def is_server_matched(client: AnyClient) -> bool | None:
 class ServerWatch:
     """Calls back when the server of a client was matched, or is no longer.
 
-    No event reports that, but each match follows a change of the graph: it is looked at then, and
-    again each 0.2 s while the graph has a server that is not matched.
+    No event reports that, but each match follows a change of the graph.
 
     Args:
         node: of the client.
         client: to watch; `stop` before it is destroyed.
         changed: called in a thread of the graph, also by the constructor if a server is matched
-            already. It must be quick, and ask again by itself.
+            already; quick.
     """
 
     def __init__(self, node: Node, client: AnyClient, changed: Callable[[], None]) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 
+from msgspec.structs import replace
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -21,7 +22,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import UNKNOWN_QOS
-from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.tool_filter import known_node
 
@@ -36,69 +37,60 @@ _TOPIC, _REQUEST, _REPLY = ("rt{}", "rq{}Request", "rr{}Reply") if OVER_DDS else
 _NODES = "ros_discovery_info"
 """Every participant of rmw_fastrtps and rmw_cyclonedds writes it, and no other."""
 
+_OF_TOPICS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+OF_SERVICES = (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT)
+
 _GID_BYTES = 16
 
 _REFUSED = (ValueError, rclpy_implementation.RCLError)
 """What rclpy's queries raise where a name or a value cannot be had: UnicodeDecodeError is one."""
 
-Ends = tuple[list[ObservedEndpoint], list[ObservedEndpoint]]
-"""Of a service's servers or clients: what reads or writes requests, then replies."""
-
 
 def endpoints_of(node: Node, kind: EndpointKind, name: str) -> list[ObservedEndpoint]:
-    """Return what `node` sees of the endpoints of a kind and name.
+    """Return what `node` sees of the endpoints of a kind and name (fully qualified).
 
-    Args:
-        node: that queries.
-        kind: PUBLISHER or SUBSCRIPTION; of a service SERVICE_SERVER, for what reads its requests,
-            or SERVICE_CLIENT, for what writes them.
-        name: fully qualified.
+    Of a service a SERVICE_SERVER is what reads its requests, a SERVICE_CLIENT what writes them.
     """
-    writes = kind in (EndpointKind.PUBLISHER, EndpointKind.SERVICE_CLIENT)
     pattern = _TOPIC if kind.is_topic else _REQUEST
-    return _read(node, kind, name, pattern.format(name), writes=writes)
+    return _read(node, kind, name, pattern.format(name))
 
 
-def service_ends(node: Node, kind: EndpointKind, service: str) -> Ends:
-    """Return what `node` sees of a service's servers or clients; nothing where no DDS topic is.
+def with_reply(node: Node, requests: list[ObservedEndpoint]) -> list[ObservedEndpoint]:
+    """Return the ends of one node at the requests of a service with the hash of that service.
 
-    The type hashes (REP-2016) of services are found there: rmw_fastrtps and rmw_cyclonedds announce
-    them since Iron.
+    It is joined (REP-2016) of what rmw_fastrtps and rmw_cyclonedds announce of both its topics,
+    empty while only half of it is seen. Several servers or clients of a node are one end of it. A
+    client has no GID: whoever asks may ask with several.
     """
-    if not OVER_DDS:
-        return [], []
-    asks = kind is EndpointKind.SERVICE_CLIENT
-    return (
-        _read(node, kind, service, _REQUEST.format(service), writes=asks),
-        _read(node, kind, service, _REPLY.format(service), writes=not asks),
+    first = requests[0]
+    asks = first.kind is EndpointKind.SERVICE_CLIENT
+    topic = _REPLY.format(first.name)
+    replies = _read(node, first.kind, first.name, topic, writes=not asks)
+    sides = requests, [each for each in replies if each.node == first.node]
+    hashes = [{each.type_hash or "" for each in side} for side in sides]
+    type_hash = join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
+    ends = (
+        replace(each, qos=None, type_hash=type_hash, gid="" if asks and each.node else each.gid)
+        for each in requests
     )
+    return list(dict.fromkeys(ends))
 
 
-def service_hash(ends: Ends, node: str) -> str | None:
-    """Return the joined hashes of a node's ends, empty while only half of it is seen; else None.
-
-    None means that the RMW has no such topics, or that nothing of them is seen.
-    """
-    hashes = [{each.type_hash or "" for each in side if each.node == node} for side in ends]
-    if not any(hashes):
-        return None
-    # A node with several servers or clients of one name is one end: all of them count.
-    return join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
-
-
-def topic_endpoints(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint]:
-    """Yield all publishers and subscriptions of topics of the RMW, but those of services.
+def endpoints_in(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint]:
+    """Yield the publishers and subscriptions of topics of the RMW, and what is at requests there.
 
     A topic of a node that avoids the naming conventions of ROS has its name of DDS behind `dds:`:
     `dds:/chatter` is not `/chatter`.
     """
     for topic in topics:
-        if topic == _NODES or (OVER_DDS and topic.startswith(("rq/", "rr/"))):
+        if topic == _NODES or (OVER_DDS and topic.startswith("rr/")):
             continue
         name = _of_ros(topic)
-        shown = f"{RAW}{topic}" if OVER_DDS and name == topic else name
-        for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
-            yield from _read(node, kind, shown, topic, writes=kind is EndpointKind.PUBLISHER)
+        kinds, shown = _OF_TOPICS, f"{RAW}{topic}" if OVER_DDS and name == topic else name
+        if OVER_DDS and topic.startswith("rq/") and topic.endswith("Request"):
+            kinds, shown = OF_SERVICES, topic.removeprefix("rq").removesuffix("Request")
+        for kind in kinds:
+            yield from _read(node, kind, shown, topic)
 
 
 def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str], str]:
@@ -120,18 +112,18 @@ def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str]
     return frozenset(topic for topic, _ in found), ""
 
 
-def rmw_topics(names: Iterable[str]) -> set[str]:
-    """Return what the RMW calls topics of ROS."""
-    return set(map(_TOPIC.format, names))
+def rmw_topics(topics: Iterable[str], services: Iterable[str]) -> set[str]:
+    """Return what the RMW calls topics of ROS, and the requests of services."""
+    return {*map(_TOPIC.format, topics), *map(_REQUEST.format, services)}
 
 
-def services_in(topics: Iterable[str]) -> set[str]:
-    """Return the names of the services whose requests are among topics of the RMW."""
-    return {
-        topic.removeprefix("rq").removesuffix("Request")
-        for topic in topics
-        if topic.startswith("rq/") and topic.endswith("Request")
-    }
+def services_of_node(node: Node, full_name: str) -> list[ObservedEndpoint]:
+    """Return the services and clients of a node, for an RMW that has no topics of them."""
+    return [
+        ObservedEndpoint(kind=kind, node=full_name, name=name, type=type_)
+        for kind in OF_SERVICES
+        for name, type_ in endpoints_of_node(node, kind, full_name) or ()
+    ]
 
 
 def endpoints_of_node(
@@ -157,15 +149,6 @@ def endpoints_of_node(
         return None
 
 
-def node_names(node: Node) -> list[str]:
-    """Return the names that the RMW has, of nodes that have left too; none if it cannot say all."""
-    try:
-        found = node.get_node_names_and_namespaces()
-    except _REFUSED:
-        return []
-    return [f"{space.rstrip('/')}/{name}" for name, space in found]
-
-
 def unreadable(kind: EndpointKind, name: str) -> ObservedEndpoint:
     """Return what stands for all endpoints of a topic of which one has a name that is no UTF-8."""
     return ObservedEndpoint(
@@ -174,8 +157,11 @@ def unreadable(kind: EndpointKind, name: str) -> ObservedEndpoint:
 
 
 def _read(
-    node: Node, kind: EndpointKind, name: str, topic: str, *, writes: bool
+    node: Node, kind: EndpointKind, name: str, topic: str, *, writes: bool | None = None
 ) -> list[ObservedEndpoint]:
+    """Return who writes a topic of the RMW, or reads it; by default as the kind does requests."""
+    if writes is None:
+        writes = kind in (EndpointKind.PUBLISHER, EndpointKind.SERVICE_CLIENT)
     query = node.get_publishers_info_by_topic if writes else node.get_subscriptions_info_by_topic
     try:
         return [_observed(kind, name, info) for info in query(topic, no_mangle=True)]

@@ -1,8 +1,7 @@
 """Hidden nodes: a DDS participant with nothing on it but what was requested.
 
 Owns: how such a node and its context are made, and which of them this process has; showing an
-endpoint that was made there to the node that it serves: whatever spins that node spins it, now and
-later, by that node's callback groups.
+endpoint that was made there to the node that it serves, whose executor and callback groups run it.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile, participant_settings
+from lifecycle.middleware.fastdds.factory import discovery_by_profile, participant_settings
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.versions import installed, private
 
@@ -75,10 +74,7 @@ def quiet_node(
 
 
 def bare_node(context: rclpy.Context) -> Any:
-    """Return rclpy's handle of a hidden node without any endpoint.
-
-    The first node of a context makes its participant.
-    """
+    """Return rclpy's handle of a hidden node without endpoints; the first makes a participant."""
     name = f"_lifecycle_names_{os.getpid()}_{next(_numbers)}"
     more = (QoSProfile(depth=1).get_c_qos_profile(),) if installed().node_takes_rosout else ()
     try:
@@ -92,12 +88,12 @@ _numbers = itertools.count()
 
 
 def republish_names(nodes: Iterable[Node]) -> None:
-    """Make the participants of `nodes` publish anew which nodes and endpoints they have.
+    """Make the participants of `nodes`, one of each, publish their nodes and endpoints anew.
 
     After an outage rmw_dds_common keeps the name of a node whose participant was dropped, and found
     again, out of the graph until then. rmw_fastrtps publishes it whenever a node is made. It has no
     endpoints: when one ends, a discovery server of Fast DDS 2.14 drops for good what it has not
-    relayed yet of that participant's others. Take one node of each participant.
+    relayed yet of that participant's others.
     """
     for node in nodes:
         bare_node(node.context).destroy_when_not_in_use()
@@ -107,13 +103,7 @@ def republish_names(nodes: Iterable[Node]) -> None:
 def made_participant(context: rclpy.Context, settings: ParticipantSettings) -> Iterator[None]:
     """Make the participant of a context with these settings; construct its first node in the block.
 
-    Args:
-        context: initialised in `discovery_by_profile`; settings have no effect where it has a
-            participant already.
-        settings: of the participant.
-
-    Raises:
-        MiddlewareError: as `participant_settings`.
+    Settings have no effect where it has a participant already. Raises as `participant_settings`.
     """
     with participant_settings(context, settings):
         first = bare_node(context)
@@ -151,7 +141,7 @@ _KINDS = {Subscription: "subscription", Service: "service", Client: "client"}
 def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
     """Have `host`'s executor run the callbacks of an endpoint that `maker` has just made.
 
-    Its callback group must be one of `host`'s. `host.destroy_…` takes it away again.
+    Its callback group must be one of `host`'s.
     """
     if isinstance(entity, Waitable):
         maker.remove_waitable(entity)

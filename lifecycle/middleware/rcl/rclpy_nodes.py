@@ -1,11 +1,10 @@
-"""Nodes of rclpy's own classes: their construction, their endpoints and their state machine.
+"""Nodes of rclpy's own classes: construction, endpoints, state machine, executor.
 
 Owns: wrappers of public methods of rclpy.node.Node, by which a process that hosts nodes gives them
-their planned names and knows each publisher, subscription, service, client and action that they
-make; and the state machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows
-what its callbacks raise, and an invalid request by service ends the process
-(rclpy/lifecycle/node.py). Of rclpy it takes private names as Jazzy and Kilted have them, and
-refuses to drive a node that has others.
+their planned names and knows each endpoint that they make; and the state machine of
+rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what its callbacks raise, and an
+invalid request by service ends the process (rclpy/lifecycle/node.py). Of rclpy it takes private
+names as Jazzy and Kilted have them, and refuses to drive a node that has others.
 """
 
 from __future__ import annotations
@@ -18,9 +17,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.task import Task
+from rclpy.timer import Timer
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.versions import private
@@ -66,11 +71,7 @@ class NodeHooks(Protocol):
 
 
 def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
-    """Notify `hooks` of every node of this process from now on, whatever class it is of.
-
-    Returns:
-        What ends that.
-    """
+    """Notify `hooks` of every node of this process from now on; returns what ends that."""
     initialise, destroy = Node.__init__, Node.destroy_node
 
     @functools.wraps(initialise)
@@ -87,9 +88,9 @@ def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
         "__init__": construct,
         "destroy_node": destroy_node,
         "add_waitable": _noting_actions(Node.add_waitable, hooks),
+        **{name: _noting(getattr(Node, name), kind, hooks) for name, kind in _FACTORIES},
+        **{name: _forgetting(getattr(Node, name), hooks) for name in _REMOVERS},
     }
-    wrapped |= {name: _noting(getattr(Node, name), kind, hooks) for name, kind in _FACTORIES}
-    wrapped |= {name: _forgetting(getattr(Node, name), hooks) for name in _REMOVERS}
     before = {name: getattr(Node, name) for name in wrapped}
 
     def put(methods: Mapping[str, Callable[..., Any]]) -> None:
@@ -206,13 +207,6 @@ class MachineOwner(Protocol):
         """Log why a request or a callback failed."""
 
 
-_BY_LABEL = {
-    "configure": "trigger_configure",
-    "activate": "trigger_activate",
-    "deactivate": "trigger_deactivate",
-    "cleanup": "trigger_cleanup",
-    "shutdown": "trigger_shutdown",
-}
 _DONE_IN = {
     Transition.TRANSITION_CONFIGURE: ("inactive", "active"),
     Transition.TRANSITION_CLEANUP: ("unconfigured",),
@@ -232,10 +226,6 @@ class RclpyStateMachine:
     transitions, too. Where a supervisor drives the node, the node's own code gets SUCCESS for what
     is reached already, and FAILURE where the gate is closed. By its services, and from its
     supervisor, the same request is an error.
-
-    Args:
-        node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.
-        owner: decides on activation, and is notified.
 
     Raises:
         MiddlewareError: rclpy keeps its state machine otherwise than is known.
@@ -275,16 +265,13 @@ class RclpyStateMachine:
         private(self._node, _MACHINE, _DRIVE).destroy_when_not_in_use()
 
     def change(self, transition: str) -> Any:
-        """Run a transition, callbacks included, and return what its callback returned.
-
-        Args:
-            transition: configure, activate, deactivate, cleanup or shutdown.
+        """Run configure, activate, deactivate, cleanup or shutdown; return what its callback did.
 
         Raises:
             RCLError: not possible in this state, or not now.
         """
         with self._asked():
-            return getattr(self._node, _BY_LABEL[transition])()
+            return getattr(self._node, f"trigger_{transition}")()
 
     @contextlib.contextmanager
     def _asked(self) -> Iterator[None]:
@@ -304,20 +291,17 @@ class RclpyStateMachine:
         if transition_id == Transition.TRANSITION_ACTIVATE and not self._owner.may_activate():
             if not is_own:
                 raise RCLError("the gate of its supervisor is closed")
-            self._say_that_it_is_held()
+            if not self._has_said:
+                self._has_said = True
+                self._owner.complain(
+                    "its own code asks to activate it while the gate of its supervisor is closed: "
+                    "it activates once the gate lets it through"
+                )
             return TransitionCallbackReturn.FAILURE
         try:
             return self._change(transition_id)
         finally:
             self._owner.state_changed()
-
-    def _say_that_it_is_held(self) -> None:
-        if not self._has_said:
-            self._has_said = True
-            self._owner.complain(
-                "its own code asks to activate it while the gate of its supervisor is closed: it "
-                "activates once the gate lets it through"
-            )
 
     def _reporting(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         name = getattr(callback, "__name__", "a callback")
@@ -359,15 +343,13 @@ class RclpyStateMachine:
 
 def is_rclpy_managed(node: object) -> bool:
     """Whether an object, or a class, is of rclpy.lifecycle."""
-    if isinstance(node, type):
-        return issubclass(node, LifecycleNodeMixin)
-    return isinstance(node, LifecycleNodeMixin)
+    return issubclass(node if isinstance(node, type) else type(node), LifecycleNodeMixin)
 
 
 class Watching:
-    """What an executor of ours waits for that belongs to no node: add it as if it were one.
+    """What an executor of ours waits for beside nodes: add it as if it were one.
 
-    Events of nodes whose own executor does not run, or is another one.
+    Events and services of nodes whose own executor does not run, or is another one.
     """
 
     def __init__(self) -> None:
@@ -413,3 +395,42 @@ class Watching:
     def _wake(self) -> None:
         if self.executor is not None:
             self.executor.wake()
+
+
+class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is not typed
+    """Says which callback is next: its user runs it, and knows when one begins and ends."""
+
+    def next_callback(self) -> tuple[Task, Any]:
+        """Wait for a callback, or the next part of one, and return it and what it is of, or None.
+
+        Raises:
+            ShutdownException: the executor was shut down.
+            ExternalShutdownException: the context was.
+        """
+        while True:
+            try:
+                task, entity, _ = self.wait_for_ready_callbacks()
+            except InvalidHandle:  # destroyed in another thread meanwhile
+                continue
+            return task, entity
+
+
+def run(task: Task) -> None:
+    """Run a callback; raises what it raises."""
+    task()
+    if (error := task.exception()) is not None:
+        raise error
+
+
+def described(entity: Any) -> str:
+    """Return what a callback is of, in words; empty for a task."""
+    try:
+        if isinstance(entity, Subscription):
+            return f"of the subscription of {entity.topic_name}"
+        if isinstance(entity, Service):
+            return f"of the service {entity.service_name}"
+        if isinstance(entity, Timer):
+            return f"of a timer of {entity.timer_period_ns / 1e9:g} s"
+    except InvalidHandle:
+        pass  # a callback before it has destroyed it
+    return ""

@@ -2,7 +2,6 @@
 
 Owns: the private names of `rclpy.action.server` that this takes. Callers that wait for a client's
 answer learn that it is gone, and that they must not block; a server's answers are sent at once.
-What works on a goal, and when one has to end, is `lifecycle.node`'s.
 Import it late: rclpy.action imports numpy, 100 ms.
 """
 
@@ -40,7 +39,7 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
     Args:
         node: whose participant it is on.
         action_type: action class.
-        name: as given to rcl, which expands it and applies the node's remapping rules.
+        name: as given to rcl, which expands and remaps it.
         group: callback group of its answers.
         refuse_to_block: called with what blocks and what does not, before something blocks; raises
             where that would wait for ever.
@@ -179,9 +178,9 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
     Args:
         node: whose participant it is on.
         action_type: action class.
-        name: as given to rcl, which expands it and applies the node's remapping rules.
-        execute: works on a goal and returns its result, or None for an empty one; must not raise.
-            It should have brought the goal to an end: one that it did not is aborted.
+        name: as given to rcl, which expands and remaps it.
+        execute: works on a goal and returns its result, or None for an empty one; must not raise. A
+            goal that it did not bring to an end is aborted.
         accept: decides on a goal.
         group: callback group of its requests.
 
@@ -223,11 +222,8 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         return tuple(each for each in self._accepted if each.is_active)
 
     def finish(self, goal: ServerGoalHandle, result: Any | None) -> None:
-        """Answer all that wait for a goal, now; the first answer counts.
-
-        Args:
-            goal: aborted, if it has not ended.
-            result: of the action's result class; None for an empty one.
+        """Answer all that wait for a goal now, aborted if it has not ended; the first answer
+        counts.
         """
         futures = private(self, "_result_futures", "answer who waits for a goal")
         future = futures.get(bytes(goal.goal_id.uuid))

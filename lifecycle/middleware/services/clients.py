@@ -1,8 +1,8 @@
-"""Clients of the lifecycle services and the node configuration of other processes' nodes.
+"""Clients of the lifecycle, parameter and container services and of our node interface.
 
-Owns: the requests to nodes that we reach only through their services, ours or foreign, and how an
-unanswered one is understood: a change_state without a reply is not a failed transition, so the
-state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
+Owns: the requests to nodes that we reach only through their services, and how an unanswered one is
+understood: a change_state without a reply is not a failed transition, so the state is read again
+(rcl_lifecycle, lifecycle_msgs/srv/*).
 """
 
 from __future__ import annotations
@@ -14,28 +14,37 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.msg import ParameterEvent
-from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
+from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.clock import Clock, ClockType
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_parameter_events
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
-from lifecycle.middleware.services.parameters import (
-    TYPES,
-    differs,
-    given_values,
-    read_parameters,
+from lifecycle.middleware.rcl.conversions import (
+    PARAMETER_TYPES,
+    import_interface,
+    parameter_to_rclpy,
+    parameter_value,
+    to_rclpy,
     type_word,
 )
+from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
 from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.parameters import COMMAND, DEFAULT
 from lifecycle.verify.observation import (
     ConfigurationError,
     NodeConfiguration,
@@ -106,8 +115,8 @@ class NodeClients:
     ) -> bool:
         """Ask for one transition, wait until it is over, and return whether it succeeded.
 
-        The request is sent once. While the reply is missing, the state is read now and then: one
-        that has reached the transition's goal counts as the reply.
+        While the reply is missing, the state is read now and then: one that has reached the
+        transition's goal counts as the reply.
 
         Args:
             node: whose state.
@@ -138,10 +147,7 @@ class NodeClients:
     ) -> NodeConfiguration | None:
         """Read the node configuration interface; None where discovery shows none on the node.
 
-        Args:
-            node: that has it.
-            timeout_s: for the answer.
-            expected: the node has one, so that it is waited for if discovery does not show it yet.
+        One that is `expected` is waited for if discovery does not show it yet.
         """
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
@@ -160,13 +166,8 @@ class NodeClients:
     ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
-        The request is sent once; while the reply is missing, what the container has counts as one.
-
-        Returns:
-            What has the container unload it again; raises as this does.
-
-        Raises:
-            MiddlewareError: also where composition_interfaces is not installed.
+        While the reply is missing, what the container has counts as one. Returns what has it unload
+        the node again; raises as this does.
         """
         what = f"load {node.run.component!r} into {container!r}"
         try:
@@ -205,7 +206,7 @@ class NodeClients:
                 node_name=node.name,
                 node_namespace=node.namespace,
                 remap_rules=[f"{source}:={target}" for source, target in node.remap],
-                parameters=_messages(given_values(node).values()),
+                parameters=_messages(_given_values(node).values()),
                 extra_arguments=_messages(extra),
             )
             return int(response.unique_id)
@@ -234,7 +235,7 @@ class NodeClients:
         """Read every parameter that a node declares, with types, values and descriptions."""
         from lifecycle.export.captured import CapturedParameter
 
-        found = await read_parameters(self._calls, node, None, timeout_s=timeout_s)
+        found = await self._read_parameters(node, None, timeout_s=timeout_s)
         return tuple(
             CapturedParameter(
                 name=of.name,
@@ -250,11 +251,53 @@ class NodeClients:
         self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[ParameterReport, ...]:
         """Read those parameters of a node that are named and that it has; None reads all."""
-        found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
+        found = await self._read_parameters(node, names, timeout_s=timeout_s)
         return tuple(
             ParameterReport.of(of.name, type_ or type_word(of.type), value, read_only=of.read_only)
             for of, type_, value in found
         )
+
+    async def _read_parameters(
+        self, node: str, names: Collection[str] | None, *, timeout_s: float
+    ) -> list[tuple[ParameterDescriptor, str, ParameterValue | None]]:
+        """Read descriptor, our name of the type, and value of parameters of a node, sorted by name.
+
+        One that is declared and not set has an empty type and no value.
+
+        Args:
+            node: fully qualified name.
+            names: those that it has of these; None for all.
+            timeout_s: for each request.
+        """
+
+        async def ask(service: str, type_: type[Any], **fields: Any) -> Any:
+            return await self._calls.call(f"{node}/{service}", type_, timeout_s, **fields)
+
+        async def get(asked: list[str]) -> list[Any]:
+            return list((await ask("get_parameters", GetParameters, names=asked)).values)
+
+        has = set((await ask("list_parameters", ListParameters)).result.names)
+        wanted = sorted(has if names is None else has.intersection(names))
+        if not wanted:
+            return []
+        described, values = await asyncio.gather(
+            ask("describe_parameters", DescribeParameters, names=wanted), get(wanted)
+        )
+        if len(values) != len(wanted):
+            # One that is declared and not set makes rclpy and rclcpp answer with none at all.
+            alone = await asyncio.gather(*(get([name]) for name in wanted))
+            values = [each[0] if each else ParameterValueMessage() for each in alone]
+        found = {each.name: each for each in described.descriptors}
+        return [
+            (
+                found.get(name, ParameterDescriptor(name=name)),
+                type_word(value.type),
+                parameter_value(parameter_value_to_python(value))
+                if type_word(value.type)
+                else None,
+            )
+            for name, value in zip(wanted, values, strict=True)
+        ]
 
     async def give_parameters(self, planned: PlannedNode) -> None:
         """Set the parameters that a running node has with other values than its plan gives it."""
@@ -262,9 +305,9 @@ class NodeClients:
         if not any(each.value is not None for each in planned.expected_parameters):
             return
         has = {each.name: each for each in await self.report_parameters(node, None)}
-        values = given_values(planned, {name: each.type for name, each in has.items()})
+        values = _given_values(planned, {name: each.type for name, each in has.items()})
         wanted = {
-            name: each for name, each in values.items() if name in has and differs(has[name], each)
+            name: each for name, each in values.items() if name in has and _differs(has[name], each)
         }
         if not wanted:
             return
@@ -283,9 +326,11 @@ class NodeClients:
         Args:
             node: whose they are.
             values: by parameter.
-            types: by parameter, names of rcl_interfaces: "int", "double_array".
+            types: by parameter, "int", "double_array".
         """
-        given = _messages(Parameter(name, TYPES[types[name]], values[name]) for name in values)
+        given = _messages(
+            Parameter(name, PARAMETER_TYPES[types[name]], values[name]) for name in values
+        )
         response = await self._calls.call(
             f"{node}/set_parameters_atomically",
             SetParametersAtomically,
@@ -298,8 +343,7 @@ class NodeClients:
     def serves_parameters(self, node: str) -> bool | None:
         """Return whether a node has parameter services; None while discovery may not show them yet.
 
-        Client libraries make them before the type description service: if that is shown alone,
-        there are none.
+        Client libraries make them before the type description service.
         """
         offered = self._observer.services_of(node)
         if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
@@ -311,11 +355,8 @@ class NodeClients:
     ) -> bool | None:
         """Return whether a node answers one small request; None where it serves nothing to ask.
 
-        Args:
-            node: that is asked.
-            managed: it has a state, which is asked for; else it is asked for no parameter.
-            timeout_s: for the answer.
-            repeat: see ServiceCalls; else a reply that is lost is none.
+        A `managed` one is asked for its state, another for no parameter. Unless `repeat`, a reply
+        that is lost is none.
         """
         type_ = GetState if managed else GetParameters
         service = f"{node}/get_{'state' if managed else 'parameters'}"
@@ -347,7 +388,7 @@ class NodeClients:
             timeout_s: for the answer.
         """
         is_text = isinstance(value, str)
-        type_ = TYPES["string" if is_text else "string_array"]
+        type_ = PARAMETER_TYPES["string" if is_text else "string_array"]
         given = _messages([Parameter(name, type_, value if is_text else list(value))])
         # Each of them makes the same state again when it arrives twice.
         response = await self._calls.call(
@@ -404,11 +445,7 @@ class NodeClients:
         qos: QosProfile,
         callback: Callable[[bytes, Mapping[str, int]], None],
     ) -> None:
-        """Have `callback` called with each message of a topic, serialized, and its message info.
-
-        Raises:
-            MiddlewareError: the type is not installed here.
-        """
+        """Have `callback` called with each message of a topic, serialized, and its message info."""
         self._subscribe(import_interface(type_), topic, callback, to_rclpy(qos), raw=True)
 
     def forget(self, node: str) -> None:
@@ -473,3 +510,27 @@ def _check(what: str, accepted: bool, reason: str) -> None:
 
 def _messages(parameters: Iterable[Parameter]) -> list[Any]:
     return [each.to_parameter_msg() for each in parameters]
+
+
+def _given_values(planned: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return what a plan gives a node's parameters, by name, but by its command line.
+
+    Empty arrays are among them, too: rcl reads none from a command line. One whose type is declared
+    nowhere is given by the type that the node `has` for it, and not at all where that is unknown.
+    """
+    given = {}
+    for each in planned.expected_parameters:
+        word = (has or {}).get(each.name, "") if each.type == "array" else each.type
+        is_known = word in PARAMETER_TYPES and (each.type != "array" or word.endswith("_array"))
+        is_given = each.value is not None and each.source != DEFAULT
+        if is_known and is_given and (each.source != COMMAND or each.value == ()):
+            given[each.name] = Parameter(
+                each.name, PARAMETER_TYPES[word], parameter_to_rclpy(each.raw, word)
+            )
+    return given
+
+
+def _differs(has: ParameterReport, given: Parameter) -> bool:
+    """Whether a node has another value than it is given; what is not a number equals itself."""
+    type_, value = type_word(given.type_.value), parameter_value(given.value)
+    return has != ParameterReport.of(has.name, type_, value, read_only=has.read_only)

@@ -1,9 +1,8 @@
 """Call ROS services from asyncio, with a deadline and retries.
 
 Owns: one executor thread on the observer's node where that is its own, the bridge from rclpy's
-futures to asyncio's, and the rule for requests that stay unanswered. rmw_fastrtps drops a reply
-when the client's reader is not matched yet, so a request that may be repeated is repeated until its
-deadline.
+futures to asyncio's, and the rule for requests that stay unanswered: rmw_fastrtps drops a reply
+when the client's reader is not matched yet, so what may be repeated is repeated until its deadline.
 """
 
 from __future__ import annotations
@@ -35,11 +34,7 @@ rmw_fastrtps calls a client ready only while all servers of the name are matched
 
 
 class ServiceUnansweredError(MiddlewareError):
-    """A service was not there or did not answer before the deadline.
-
-    Attributes:
-        found: whether it was there, so that the request was sent.
-    """
+    """A service was not there or, if `found`, did not answer before the deadline."""
 
     def __init__(self, service: str, *, found: bool, timeout_s: float) -> None:
         what = "it did not answer" if found else "nobody offers it"
@@ -48,13 +43,11 @@ class ServiceUnansweredError(MiddlewareError):
 
 
 class ServiceCalls:
-    """Calls services on the observer's node; the participant is the observer's.
-
-    Must be used from one asyncio loop; `destroy` it before the observer.
+    """Calls services on the observer's node, from one asyncio loop; `destroy` it first.
 
     Attributes:
-        group: reentrant, for all that is made on the node: on a node that others spin, replies
-            must come while one of its callbacks waits.
+        group: reentrant, for all that is made on the node: on a node that others spin, replies must
+            come while one of its callbacks waits.
     """
 
     def __init__(self, observer: GraphObserver) -> None:
@@ -140,10 +133,7 @@ class ServiceCalls:
         return client
 
     async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
-        """Return a client matched with every server, or long enough with some; None if none came.
-
-        It may be dropped meanwhile, with a node of that name that has left: another one is made.
-        """
+        """Return a client matched with all servers, or long enough with some; None if none came."""
         loop = asyncio.get_running_loop()
         offered_s: float | None = None
         client = self._client(service, type_)

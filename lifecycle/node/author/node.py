@@ -27,7 +27,7 @@ from rclpy.timer import Timer
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.handlers import ActionHandler

@@ -20,10 +20,10 @@ from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.parameter_files import type_of
-from lifecycle.middleware.services.parameters import (
-    TYPES,
+from lifecycle.middleware.rcl.conversions import (
+    PARAMETER_TYPES,
+    parameter_to_rclpy,
     parameter_value,
-    to_rclpy,
     type_word,
 )
 from lifecycle.node.author.spec import ros_arguments
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from lifecycle.plan.model import PlannedNode
 
-_ARRAYS = frozenset(each for name, each in TYPES.items() if name.endswith("_array"))
+_ARRAYS = frozenset(each for name, each in PARAMETER_TYPES.items() if name.endswith("_array"))
 
 
 def overrides(spec: PlannedNode) -> list[Parameter]:
@@ -48,7 +48,7 @@ def overrides(spec: PlannedNode) -> list[Parameter]:
     found: list[Parameter] = []
     for name, written in spec.parameters:
         given = raw_value(written, expected.get(name, ""))  # doubles that JSON cannot carry
-        value = to_rclpy(given, declared.get(name, "") or type_of(given))
+        value = parameter_to_rclpy(given, declared.get(name, "") or type_of(given))
         if value != []:
             found.append(Parameter(name, value=value))
     return found
@@ -110,7 +110,7 @@ def _array_type(declared: tuple[Any, ...], wanted: str | None) -> Parameter.Type
     if by_code is not None and not isinstance(by_code, Parameter.Type):
         by_code = Parameter.Type.from_parameter_value(by_code)
     # Where types differ, rclpy refuses the value, as any of another type.
-    found = TYPES[wanted] if wanted else by_code
+    found = PARAMETER_TYPES[wanted] if wanted else by_code
     return found if found in _ARRAYS else None
 
 
@@ -156,15 +156,15 @@ def declare(node: Node, spec: PlannedNode) -> None:
         descriptor = ParameterDescriptor(
             description=declared.description, read_only=declared.read_only
         )
-        value: Any = TYPES[declared.type]
+        value: Any = PARAMETER_TYPES[declared.type]
         if declared.default is not None:
-            value = to_rclpy(raw_value(declared.default, declared.type), declared.type)
+            value = parameter_to_rclpy(raw_value(declared.default, declared.type), declared.type)
         try:
             if value == [] and declared.name not in given:
-                type_ = TYPES[declared.type]
+                type_ = PARAMETER_TYPES[declared.type]
                 _declare_empty(node, node.declare_parameters, declared.name, type_, descriptor)
             else:
-                value = TYPES[declared.type] if value == [] else value
+                value = PARAMETER_TYPES[declared.type] if value == [] else value
                 node.declare_parameter(declared.name, value, descriptor)
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             problems.append(

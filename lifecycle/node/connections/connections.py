@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from lifecycle.errors import LifecycleError, MiddlewareError, nearest
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 

@@ -19,8 +19,8 @@ from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
+from lifecycle.middleware.rcl.conversions import import_interface
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
-from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.author.handlers import Key, alternatives, needs_handler
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections

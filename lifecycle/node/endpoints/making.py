@@ -18,7 +18,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
-from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name

@@ -16,10 +16,10 @@ from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.environment import reach
-from lifecycle.middleware.discovery.prober import Prober
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile
+from lifecycle.middleware.fastdds.discovery import reach
+from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.prober import Prober
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.graph_queries import OVER_DDS
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed

@@ -257,7 +257,7 @@ def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
     """Report a failure, and end the process."""
     report_failure(channel, node, error)
     channel.drain()
-    from lifecycle.middleware.process.teardown import leave_and_exit
+    from lifecycle.middleware.process.control import leave_and_exit
 
     leave_and_exit(1)
 

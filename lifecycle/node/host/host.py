@@ -55,8 +55,8 @@ def preload(types: Iterable[str] = ()) -> None:
         types: interface types that nodes use besides; one that cannot be imported is left to the
             host that needs it, which reports it.
     """
-    from lifecycle.middleware.fastdds.unsupported import unknown_versions
-    from lifecycle.middleware.rcl.qos import load_type_support
+    from lifecycle.middleware.fastdds.factory import unknown_versions
+    from lifecycle.middleware.rcl.conversions import load_type_support
 
     for name in _PRELOADED:
         importlib.import_module(name)

@@ -25,11 +25,11 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.measure.sample import SLOT_S
-from lifecycle.middleware.discovery.tcp import send_again_soon
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile
+from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
+from lifecycle.middleware.fastdds.sockets import send_again_soon
 from lifecycle.middleware.process.busy_sign import BusySign
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
 from lifecycle.node.host.control import (
     Command,

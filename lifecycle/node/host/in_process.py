@@ -19,9 +19,9 @@ from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile
-from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
+from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
+from lifecycle.middleware.rcl.conversions import import_interface, to_rclpy
 from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop

@@ -35,12 +35,10 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.process.busy_sign import BusySign
-from lifecycle.middleware.process.stacks import show_stacks_here
-from lifecycle.middleware.process.teardown import leave_and_exit
-from lifecycle.middleware.rcl.executor import NodeExecutor, described, run
+from lifecycle.middleware.process.busy_sign import BusySign, show_stacks_here
+from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
-from lifecycle.middleware.rcl.rclpy_nodes import Watching
+from lifecycle.middleware.rcl.rclpy_nodes import NodeExecutor, Watching, described, run
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.lifecycle.steps import hint
 

@@ -24,11 +24,10 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, Timeouts
 from lifecycle.manifest.names import node_alive_topic
-from lifecycle.middleware.discovery.liveliness import AliveNotice, AlivePublisher
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile
-from lifecycle.middleware.process.busy_sign import BusySign, Overdue
-from lifecycle.middleware.process.stacks import brief
+from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue, brief
+from lifecycle.middleware.services.supervisor_topics import AliveNotice, AlivePublisher
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import is_auto
 from lifecycle.node.host.adoption import Adoption, Hosted

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Run, RunKind
-from lifecycle.middleware.discovery.discovery_server import (
+from lifecycle.middleware.fastdds.discovery import (
     discovery_server_command,
     discovery_server_listens,
 )

@@ -30,7 +30,7 @@ from lifecycle.verify.tool_filter import supervisor_label, takes_diagnostics
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
+    from lifecycle.middleware.services.supervisor_topics import RosInterface as RosEntities
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]

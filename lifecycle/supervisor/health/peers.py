@@ -45,7 +45,7 @@ from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
 from lifecycle.verify.verdict import Finding, FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.middleware.discovery.liveliness import (
+    from lifecycle.middleware.services.supervisor_topics import (
         AliveNotice,
         AlivePublisher,
         AliveSubscription,
@@ -297,7 +297,7 @@ class Peers:
             self._loop.call_later(wait_s, say)
 
     def _notify(self) -> None:
-        from lifecycle.middleware.discovery.liveliness import AliveNotice
+        from lifecycle.middleware.services.supervisor_topics import AliveNotice
 
         notice = AliveNotice(
             silent=self._silent,

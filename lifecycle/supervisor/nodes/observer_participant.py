@@ -19,23 +19,26 @@ import rclpy
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.graph import Graph
 from lifecycle.graph.loop import set_within
-from lifecycle.middleware.discovery import tcp
-from lifecycle.middleware.discovery.liveliness import (
+from lifecycle.middleware.fastdds.factory import unknown_versions
+from lifecycle.middleware.fastdds.sockets import (
+    give_up_dead_connections,
+    send_again_soon,
+    widen_discovery_buffers,
+)
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.hidden_node import republish_names
+from lifecycle.middleware.services.supervisor_topics import (
     AlivePublisher,
     AliveSubscription,
     PlanNotices,
 )
-from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
-from lifecycle.middleware.fastdds.unsupported import unknown_versions
-from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.rcl.hidden_node import republish_names
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import known_node
 
 if TYPE_CHECKING:
-    from lifecycle.middleware.services.ros_interface import RosInterface
+    from lifecycle.middleware.services.supervisor_topics import RosInterface
 
 
 class ObserverParticipant:
@@ -68,8 +71,8 @@ class ObserverParticipant:
         self.watch_alive = functools.partial(AliveSubscription, node)
         self.plan_notices = functools.partial(PlanNotices, node)
         self.republish_names = functools.partial(republish_names, [node])
-        self.send_again_soon = tcp.send_again_soon
-        self.prepare_to_leave = tcp.give_up_dead_connections
+        self.send_again_soon = send_again_soon
+        self.prepare_to_leave = give_up_dead_connections
 
     @classmethod
     def open(
@@ -129,7 +132,7 @@ class ObserverParticipant:
             MiddlewareError: a package cannot be loaded, or rcl refuses.
         """
         try:
-            from lifecycle.middleware.services.ros_interface import RosInterface
+            from lifecycle.middleware.services.supervisor_topics import RosInterface
 
             return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
         except Exception as error:  # rclpy has no root of its own errors

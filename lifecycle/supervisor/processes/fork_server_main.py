@@ -27,10 +27,10 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.control import limit_resources
-from lifecycle.middleware.process.prctl import (
+from lifecycle.middleware.process.control import (
     adopt_orphans,
     drop_network_administration,
+    limit_resources,
     refuse_new_privileges,
 )
 from lifecycle.supervisor.processes.fork_server_process import PRELOAD

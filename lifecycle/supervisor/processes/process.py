@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from lifecycle.manifest.model import Output
-from lifecycle.middleware.process.stacks import brief
+from lifecycle.middleware.process.busy_sign import brief
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.printable import log_line
 from lifecycle.supervisor.processes.control_channel import ControlChannel

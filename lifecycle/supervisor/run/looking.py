@@ -25,7 +25,7 @@ from lifecycle.export.captured import CapturedParameter, CapturedSystem, Program
 from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import Picture
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
-from lifecycle.middleware.discovery.environment import peers_environment
+from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import check_memory
 from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.connections.hosts import reached_hosts

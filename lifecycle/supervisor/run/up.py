@@ -22,7 +22,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.environment import (
+from lifecycle.middleware.fastdds.discovery import (
     all_by_multicast,
     discovery_peers,
     missing_port,
@@ -33,10 +33,15 @@ from lifecycle.middleware.fastdds.profiles import (
     RANGE_VARIABLE,
     discovery_environment,
 )
-from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
-from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
+from lifecycle.middleware.process.control import (
+    adopt_orphans,
+    check_descriptors,
+    check_memory,
+    check_threads,
+    exit_after,
+)
 from lifecycle.middleware.process.shared_memory import sweep
-from lifecycle.middleware.rcl.qos import load_type_support
+from lifecycle.middleware.rcl.conversions import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
@@ -336,7 +341,7 @@ async def _observer_participant(
 ) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
-    Fast DDS may never use the first connection to it (middleware/discovery/tcp.py).
+    Fast DDS may never use the first connection to it (middleware/fastdds/sockets.py).
     """
     with ending.raised():
         await _until_interface_is_up(plan, options, emit)
@@ -437,7 +442,7 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     )
     check_memory()
     check_threads(THREADS)
-    from lifecycle.middleware.fastdds.unsupported import refuse_unsupported
+    from lifecycle.middleware.fastdds.factory import refuse_unsupported
 
     hosted = (each for each in plan.processes if each.run.kind is RunKind.PYTHON)
     refuse_unsupported(plan.node(k) for each in hosted if each.machine in own for k in each.nodes)

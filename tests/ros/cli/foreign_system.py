@@ -22,7 +22,7 @@ from std_msgs.msg import Int32, String
 from std_srvs.srv import SetBool, Trigger
 from test_msgs.action import Fibonacci
 
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.process.control import leave_and_exit
 
 
 class Scanner(Node):

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from lifecycle import codec
 from lifecycle.graph.reporter import GraphReporter
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.verify.observation import EndpointReport
 from tests.builders import configuration
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 
 from lifecycle.graph.graph import Graph
-from lifecycle.middleware.discovery.environment import SETTLE_S
+from lifecycle.middleware.fastdds.discovery import SETTLE_S
 from tests.builders import plan_of
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 

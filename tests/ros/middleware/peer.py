@@ -19,7 +19,7 @@ from lifecycle import codec
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.process.control import leave_and_exit
 
 
 def main() -> None:

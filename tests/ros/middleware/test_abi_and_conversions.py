@@ -19,7 +19,7 @@ from lifecycle.middleware.fastdds.nfe import (
     get_network_flow_endpoints,
 )
 from lifecycle.middleware.rcl import abi, hidden_node
-from lifecycle.middleware.rcl.qos import (
+from lifecycle.middleware.rcl.conversions import (
     from_rclpy,
     import_interface,
     to_rclpy,
@@ -212,7 +212,7 @@ def test_a_package_that_fails_to_import_is_not_said_to_be_missing(
         raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
 
     monkeypatch.setattr(
-        "lifecycle.middleware.rcl.qos.importlib",
+        "lifecycle.middleware.rcl.conversions.importlib",
         SimpleNamespace(import_module=import_module),
     )
     with pytest.raises(ModuleNotFoundError, match="numpy"):

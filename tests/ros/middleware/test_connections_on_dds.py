@@ -19,17 +19,17 @@ from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.discovery.discovery_server import (
+from lifecycle.middleware.fastdds.discovery import (
     discovery_server_command,
     discovery_server_listens,
 )
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import (
     get_network_flow_endpoints,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import has_shared_memory
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import OpenSocket, open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import (

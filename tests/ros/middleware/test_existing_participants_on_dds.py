@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.environment import chosen_otherwise
+from lifecycle.middleware.fastdds.discovery import chosen_otherwise
 from tests.ros.middleware.free_ports import free_ports
 
 pytestmark = pytest.mark.thorough

@@ -24,7 +24,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from lifecycle_msgs.srv import ChangeState
 from std_msgs.msg import String
-from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.process.control import leave_and_exit
 
 context = rclpy.Context()
 context.init(args=[])
@@ -72,7 +72,7 @@ def domains_own(files: Iterable[str]) -> set[str]:
 def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> None:
     hang = (
         "import ctypes\n"
-        "from lifecycle.middleware.process.teardown import leave_and_exit\n"
+        "from lifecycle.middleware.process.control import leave_and_exit\n"
         "class Hangs:\n"
         "    waitables = ()\n"
         "    def destroy_node(self): ctypes.PyDLL(None).sleep(60)\n"
@@ -84,7 +84,7 @@ def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> No
 def test_an_exception_while_leaving_is_logged_and_the_rest_still_destroyed() -> None:
     leave = (
         "import logging\n"
-        "from lifecycle.middleware.process.teardown import leave_and_exit\n"
+        "from lifecycle.middleware.process.control import leave_and_exit\n"
         "logging.basicConfig(format='%(message)s')\n"
         "class Breaks:\n"
         "    waitables = ()\n"

@@ -18,13 +18,13 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.factory import has_shared_memory, participant_settings
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import has_shared_memory, participant_settings
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
@@ -234,7 +234,7 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
             "from std_msgs.msg import String\n"
             "from lifecycle.manifest.qos import QosProfile\n"
             "from lifecycle.middleware.fastdds.participant import FlowParticipant\n"
-            "from lifecycle.middleware.process.teardown import leave_and_exit\n"
+            "from lifecycle.middleware.process.control import leave_and_exit\n"
             "p = FlowParticipant('_out', '/', int(sys.argv[1]))\n"
             "publisher = p.create_publisher(String, '/flow', QosProfile())\n"
             "while not publisher.get_subscription_count(): time.sleep(0.005)\n"

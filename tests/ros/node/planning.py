@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import plan_without_manifest
 from lifecycle.node.host.adoption import Adoption, Participants

@@ -26,7 +26,7 @@ from lifecycle import ERROR, FAILURE, LifecycleNode, on_message, on_service, on_
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import ParameterDeclaration
 from lifecycle.manifest.qos import Durability, QosProfile
-from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.node.endpoints.endpoint import UnknownEndpointError
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedNode

@@ -136,7 +136,7 @@ _ALONE = """
 import sys
 from tests.ros.node.planning import planned
 from lifecycle import LifecycleNode, run
-from lifecycle.middleware.fastdds.settings import has_shared_memory
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 
 class It(LifecycleNode):
     def on_configure(self):

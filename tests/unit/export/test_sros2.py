@@ -14,7 +14,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import OVERRIDE, PLANS_TOPIC, enclaves_of, render_policy
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
-from lifecycle.middleware.discovery import liveliness
+from lifecycle.middleware.services import supervisor_topics
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 
@@ -160,7 +160,7 @@ def test_names_of_topics_are_those_that_the_middleware_uses(tmp_path: Path) -> N
     here = "/my_robot/supervisor_here"
     mine, others = (supervisor_alive_topic("my-robot", each) for each in ("here", "there"))
 
-    assert PLANS_TOPIC == liveliness.PLANS_TOPIC
+    assert PLANS_TOPIC == supervisor_topics.PLANS_TOPIC
     assert mine in allowed(policy, here, "publish")
     assert others in allowed(policy, here, "subscribe")
     assert node_alive_topic("/dock") in allowed(policy, here, "subscribe")

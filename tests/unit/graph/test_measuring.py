@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import pytest
 
-from lifecycle.graph.measuring import TopicMeasurements
+from lifecycle.graph.readings import TopicMeasurements
 from lifecycle.manifest.model import Machine, Run, RunKind
 from lifecycle.plan.model import Plan
 from tests.builders import at, link, node, planned, publisher, subscription

@@ -11,9 +11,9 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.diagnostics import Diagnostic, DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.observer import Observer
+from lifecycle.graph.readings import Diagnostic, DiagnosticReadings
 from lifecycle.manifest.model import (
     After,
     EndpointKind,

@@ -9,7 +9,7 @@ import pytest
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import GraphLoop
-from lifecycle.graph.parameters import (
+from lifecycle.graph.readings import (
     AGAIN_AT_MOST_S,
     AGAIN_S,
     ANSWER_S,

@@ -6,7 +6,7 @@ import contextlib
 import socket
 import time
 
-from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
+from lifecycle.middleware.fastdds.sockets import give_up_dead_connections, is_used
 
 _ESTABLISHED, _SYN_SENT = 1, 2  # tcp_states.h
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -35,11 +34,9 @@ class End:
 
 @dataclasses.dataclass
 class Graph:
-    """What rclpy shows: the queries that a snapshot makes, of these ends and names."""
+    """What rclpy shows: the queries that a snapshot makes, of these ends."""
 
     ends: list[End]
-    names: list[str] = dataclasses.field(default_factory=list)
-    services: dict[str, list[tuple[str, list[str]]]] = dataclasses.field(default_factory=dict)
     context: SimpleNamespace = dataclasses.field(
         default_factory=lambda: SimpleNamespace(get_domain_id=lambda: 7)
     )
@@ -77,23 +74,6 @@ class Graph:
         """Return readers, likewise."""
         assert no_mangle
         return self._infos(False, topic)
-
-    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Return the names that the RMW has, of nodes that have left too."""
-        return [(name, "/") for name in self.names]
-
-    def get_service_names_and_types_by_node(self, name: str, _: str) -> list[tuple[str, list[str]]]:
-        """Return what the first node of a name has."""
-        if name not in self.names:
-            raise rclpy_implementation.NodeNameNonExistentError
-        return self.services.get(name, [])
-
-    def get_client_names_and_types_by_node(self, name: str, _: str) -> list[tuple[str, list[str]]]:
-        """Return none."""
-        return [] if name in self.names else self.get_service_names_and_types_by_node(name, "/")
-
-    get_publisher_names_and_types_by_node = get_client_names_and_types_by_node
-    get_subscriber_names_and_types_by_node = get_client_names_and_types_by_node
 
 
 Look = Callable[[Graph], GraphObserver]
@@ -141,24 +121,13 @@ def test_a_node_of_an_ended_process_is_nobody_while_discovery_shows_it(look: Loo
 
 
 def test_a_node_that_has_nothing_but_a_service_is_one(look: Look) -> None:
-    shown = Graph(
-        server("lamp", "/on"),
-        names=["lamp"],
-        services={"lamp": [("/on", ["std_srvs/srv/Trigger"])]},
-    )
-    nodes, (endpoint,) = look(shown).snapshot()
+    nodes, (endpoint,) = look(Graph(server("lamp", "/on"))).snapshot()
     assert [each.full_name for each in nodes] == ["/lamp"]
     assert (endpoint.node, endpoint.name, endpoint.gid[:24]) == ("/lamp", "/on", ONE)
 
 
-def test_behind_one_that_has_left_a_node_of_its_name_has_its_services(look: Look) -> None:
-    """Of several of one name rcl lists the services of the first: here it has none left."""
-    shown = Graph([node("lamp"), *server("lamp", "/on")], names=["lamp", "lamp"])
-    assert seen(look(shown)) == [("/lamp", "/on", "std_srvs/srv/Trigger")]
-
-
 def test_a_topic_that_is_no_utf_8_is_found_and_hides_only_what_was_not_known(look: Look) -> None:
-    shown = Graph([node("one"), talker(b"one", b"rt/known"), talker(b"one")], names=["one"])
+    shown = Graph([node("one"), talker(b"one", b"rt/known"), talker(b"one")])
     bad = talker(b"one", b"rt/f\xffo")
     observer = look(shown)
     known = [("/one", "/chatter", "std_msgs/msg/String"), ("/one", "/known", "std_msgs/msg/String")]
@@ -171,5 +140,4 @@ def test_a_topic_that_is_no_utf_8_is_found_and_hides_only_what_was_not_known(loo
 
 def test_a_topic_on_which_a_node_is_no_utf_8_is_one_of_an_unknown_node(look: Look) -> None:
     shown = Graph([node("one"), talker(b"one", b"rt/sound"), talker(b"one"), talker(b"\xff")])
-    shown.names = ["one"]
     assert seen(look(shown)) == [("", "/chatter", ""), ("/one", "/sound", "std_msgs/msg/String")]

@@ -9,10 +9,11 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
+    ParticipantSettings,
     default_profile,
+    profile,
 )
 from lifecycle.plan.model import ParticipantConnections
 

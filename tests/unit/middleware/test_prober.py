@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery import prober as probing
-from lifecycle.middleware.discovery.environment import (
+from lifecycle.middleware.fastdds import prober as probing
+from lifecycle.middleware.fastdds.discovery import (
     chosen_otherwise,
     is_served,
     missing_port,
     reach,
     settle_s,
 )
-from lifecycle.middleware.discovery.prober import ANSWER_S, Prober, Settling, leave_all
+from lifecycle.middleware.fastdds.prober import ANSWER_S, Prober, Settling, leave_all
 from lifecycle.network.connection_url import parse
 from lifecycle.network.ports import participant_ports
 from lifecycle.pytest_plugin import claimed_domain

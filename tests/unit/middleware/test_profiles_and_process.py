@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.discovery.environment import all_by_multicast
+from lifecycle.middleware.fastdds.discovery import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.network.ports import participant_ports

@@ -11,7 +11,7 @@ ROOT = Path(lifecycle.__file__).parent
 
 CTYPES = {
     "middleware/fastdds/factory.py",  # participants from profiles, eight public functions
-    "middleware/process/prctl.py",  # prctl(2), and timers that end a process
+    "middleware/process/control.py",  # prctl(2), and timers that end a process
     "middleware/rcl/abi.py",  # rcl's C API, checked by version and layout
 }
 """Files that call libraries other than by Python."""

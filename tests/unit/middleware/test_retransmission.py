@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from lifecycle.middleware.discovery.tcp import AT_MOST_S, send_again_soon
+from lifecycle.middleware.fastdds.sockets import AT_MOST_S, send_again_soon
 
 _TCP_RTO_MAX_MS = 44
 KNOWN = tuple(int(each) for each in platform.release().split(".")[:2]) >= (6, 15)

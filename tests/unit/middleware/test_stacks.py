@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import lifecycle
-from lifecycle.middleware.process import stacks
+from lifecycle.middleware.process import busy_sign
 from lifecycle.middleware.process.busy_sign import BusySign
 
 OURS = str(Path(lifecycle.__file__).parent)
@@ -20,20 +20,20 @@ def thread(*frames: tuple[str, int, str]) -> str:
     return "\n".join(["Thread 0x00007f649a02a4c0 (most recent call first):", *lines, ""])
 
 
-EXECUTOR = (f"{OURS}/middleware/rcl/executor.py", 347, "_run_timer")
+EXECUTOR = (f"{OURS}/middleware/rcl/rclpy_nodes.py", 347, "_run_timer")
 HOST = (f"{OURS}/node/host/host.py", 250, "serve")
 
 
 def test_the_callback_and_what_it_called_last_are_shown() -> None:
     frames = [("/robot/deep.py", 9 - depth, f"f{depth}") for depth in range(5)]
-    found = stacks.brief(thread((f"{STDLIB}/socket.py", 1, "recv"), *frames, EXECUTOR, HOST))
+    found = busy_sign.brief(thread((f"{STDLIB}/socket.py", 1, "recv"), *frames, EXECUTOR, HOST))
     assert found == "f4 (/robot/deep.py:5) > f1 (/robot/deep.py:8) > f0 (/robot/deep.py:9)"
 
 
 def test_what_a_host_was_forked_from_is_no_callback() -> None:
     command = ("/venv/lib/python3.11/site-packages/click/core.py", 911, "invoke")
     ours = (f"{OURS}/cli/__init__.py", 201, "program")
-    assert stacks.brief(thread(EXECUTOR, HOST, command, ours)) == ""
+    assert busy_sign.brief(thread(EXECUTOR, HOST, command, ours)) == ""
 
 
 def test_a_thread_of_the_users_is_no_callback() -> None:
@@ -43,16 +43,16 @@ def test_a_thread_of_the_users_is_no_callback() -> None:
         ("/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/task.py", 239, "__call__"),
         (f"{STDLIB}/concurrent/futures/thread.py", 58, "run"),
     )
-    assert stacks.brief(f"{worker}\n{callback}") == "show (/robot/camera.py:20)"
+    assert busy_sign.brief(f"{worker}\n{callback}") == "show (/robot/camera.py:20)"
 
 
 def test_an_installed_package_of_the_users_is_shown() -> None:
     file = f"{STDLIB}/site-packages/robot/node.py"
-    assert stacks.brief(thread((file, 3, "tick"), EXECUTOR, HOST)) == f"tick ({file}:3)"
+    assert busy_sign.brief(thread((file, 3, "tick"), EXECUTOR, HOST)) == f"tick ({file}:3)"
 
 
 def test_nothing_is_shown_of_nothing() -> None:
-    assert stacks.brief("") == ""
+    assert busy_sign.brief("") == ""
 
 
 def test_another_process_shows_where_it_stands_and_what_it_does() -> None:
@@ -61,7 +61,7 @@ def test_another_process_shows_where_it_stands_and_what_it_does() -> None:
     if not child:
         try:
             sign.show_stacks()
-            stacks.show_stacks_here()
+            busy_sign.show_stacks_here()
             sign.begin(what="of the service /reset")
             time.sleep(30)
         finally:

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.static_edp import (
+from lifecycle.middleware.fastdds.profiles import (
     check_endpoint,
 )
 from lifecycle.plan.model import StaticEndpoint

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings, profile
 from lifecycle.plan.model import ParticipantConnections
 
 

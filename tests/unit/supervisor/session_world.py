@@ -28,7 +28,7 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
-from lifecycle.middleware.discovery.liveliness import AliveNotice
+from lifecycle.middleware.services.supervisor_topics import AliveNotice
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.run_directory import RunDirectory, short_path

@@ -1,9 +1,9 @@
 """The prober: a DDS participant that makes every other one that can be reached answer at once.
 
-Owns: what it sends and receives, and for how long discovery may still miss another one. It is a
-participant of its own (DDSI-RTPS 2.3 §8.5.3, §9.6.2): it has a GUID prefix and a vendor id that no
-other has, no endpoints but those by which participants find each other, and it leaves by a message
-once it has asked. Must not import rclpy.
+Owns: what it sends and receives, and for how long discovery may still miss another one. It has a
+GUID prefix and a vendor id of its own (DDSI-RTPS 2.3 §8.5.3, §9.6.2), no endpoints but those by
+which participants find each other, and it leaves by a message once it has asked. Must not import
+rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
 the same host is often lost, and who answered is quiet for its next 3 s. The prober joins once our
@@ -24,10 +24,10 @@ import time
 import weakref
 from collections.abc import Iterable, Sequence
 
-from lifecycle.middleware.discovery.environment import SETTLE_S, Reach, Target
-from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host
+from lifecycle.middleware.fastdds.discovery import SETTLE_S, Reach, Target
 from lifecycle.middleware.fastdds.profiles import PARTICIPANT_LEASE_S
 from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets
+from lifecycle.middleware.process.prefixes import PROCESS_DIGITS, is_of_host
 
 ANSWER_S = 0.15
 """A participant that is asked, on this host or the next one, answers within so long."""
@@ -62,10 +62,10 @@ _LEFT = _parameters((0x0071, b"\x00\x00\x00\x03"))  # PID_STATUS_INFO: disposed 
 
 
 def joins(prefix: bytes, sequence: int, locators: Iterable[tuple[str, int]]) -> bytes:
-    """Return the message by which a participant announces itself.
+    """Return the message by which a participant with a prefix of 12 bytes announces itself.
 
     Args:
-        prefix: its GUID prefix, 12 bytes.
+        prefix: of its GUID.
         sequence: ≥ 1, above that of its last message.
         locators: IP addresses and UDP ports at which it is answered.
     """
@@ -222,10 +222,7 @@ def leave_all() -> None:
 
 
 def _send(sender: socket.socket, message: bytes, targets: Iterable[Target]) -> None:
-    """Send a datagram to each destination, without waiting.
-
-    A full buffer or an interface without a route costs one listener, not the sender.
-    """
+    """Send a datagram to each destination; a full buffer or a missing route costs one of them."""
     for target in targets:
         with contextlib.suppress(OSError):
             if target.interface:

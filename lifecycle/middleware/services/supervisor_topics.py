@@ -1,33 +1,34 @@
-"""Liveliness (MANUAL_BY_TOPIC) of processes and its lease, and the plans that supervisors publish.
+"""What supervisors publish and offer in ROS: that they live, their plans, their status.
 
-Owns: the topics by which participants assert their liveliness. A thread of ours asserts that of a
-MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive over a link that is
-cut. A callback that holds the interpreter's lock for longer than the lease expires it too.
+Owns: the topics by which participants assert their liveliness (MANUAL_BY_TOPIC); that of plans, by
+which supervisors of one domain detect conflicts; /diagnostics, the latched status and the Trigger
+services of a supervisor. Plans, statuses and answers are text and numbers here.
 
-Fast DDS 2.14 does not repeat an assertion that was lost, so it is asserted this often. Its event
-thread, which would assert an AUTOMATIC writer, stands still while a leaving peer is removed.
+A thread of ours asserts liveliness: it ends with SIGSTOP and SIGKILL, and does not arrive over a
+link that is cut. A callback that holds the interpreter's lock for longer than the lease expires it
+too. Fast DDS's event thread, which would assert an AUTOMATIC writer, does nothing while a leaving
+peer is removed. Fast DDS 2.14 does not repeat an assertion that was lost, so it is asserted this
+often.
 
 Beside which nodes are silent, a notice says when its sender received the last one of each other
 supervisor. So two of them exchange the four timestamps by which their clocks are compared
 (lifecycle.measure.clock): Fast DDS takes them where it sends and receives. It says on which ports
 its sender receives marked datagrams, too (lifecycle.supervisor.health.marks).
-
-`PlanNotices` is the topic on which supervisors of one domain publish their plans, to detect
-conflicts. Its name holds no system: a supervisor that was started with another manifest must be
-noticed too. The last notice of each is kept for late joiners. Its content is text here, see
-lifecycle.plan.comparison.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
 import time
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import (
     PublisherEventCallbacks,
@@ -38,18 +39,22 @@ from rclpy.event_handler import (
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from std_msgs.msg import Empty, String
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.manifest.names import ALIVE_PULSE
+from lifecycle.manifest.names import ALIVE_PULSE, DIAGNOSTICS_TOPIC, supervisor_status_topic
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.qos import latched
+from lifecycle.middleware.rcl.conversions import latched
 
-ALIVE_LEASE_S = 0.85
+if TYPE_CHECKING:  # few processes need them
+    from std_srvs.srv import Trigger
+
+_LEASE_S = 0.85
 """A participant whose liveliness was not asserted for so long is lost: within a second with all
 that follows."""
 
-ASSERTED_EACH_S = 0.06
+_ASSERTED_EACH_S = 0.06
 """Fourteen fit into the lease; one takes about 150 bytes to each participant that discovered us."""
 
 _LONGEST_NOTICE = 1 << 16
@@ -86,7 +91,7 @@ _ASSERTED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
-    liveliness_lease_duration=Duration(nanoseconds=round(ALIVE_LEASE_S * 1e9)),
+    liveliness_lease_duration=Duration(nanoseconds=round(_LEASE_S * 1e9)),
 )
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
@@ -96,8 +101,7 @@ _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_defa
 class AlivePublisher:
     """Asserts the liveliness of the participant of `node` to its subscribers while it lives.
 
-    Nothing is asserted while there is no subscriber. The thread that asserts is there from the
-    start: there may be no room for another one later.
+    The thread that asserts is there from the start: there may be no room for another one later.
 
     Args:
         node: an executor spins it.
@@ -126,8 +130,7 @@ class AlivePublisher:
     def notify(self, notice: AliveNotice) -> None:
         """Publish which of our nodes are silent, and what else there is to say; from any thread.
 
-        Present and later subscribers receive it. A message may be lost for some seconds: publish
-        it again.
+        A message may be lost for some seconds: publish it again.
         """
         self._publisher.publish(String(data=to_json(notice).decode()))
 
@@ -158,15 +161,15 @@ class AlivePublisher:
                     abi.assert_liveliness(self._asserted.handle.pointer)
             except InvalidHandle:
                 return  # its node was destroyed first
-            self._ended.wait(ASSERTED_EACH_S)
+            self._ended.wait(_ASSERTED_EACH_S)
 
 
 @typing.final
 class AliveSubscription:
-    """Follows one AlivePublisher.
+    """Follows one AlivePublisher; callbacks run in the executor that spins `node`.
 
     Args:
-        node: an executor spins it; callbacks run in that executor's thread.
+        node: an executor spins it.
         topic: of the publisher.
         on_liveliness: called with True when it is alive, False when its lease has expired.
         on_left: called when it left properly.
@@ -229,11 +232,10 @@ _KEPT = 64
 
 @typing.final
 class PlanNotices:
-    """Announces our plan and receives those of others; `destroy` it.
+    """Announces our plan and receives those of others, ours too; `destroy` it.
 
-    Args:
-        node: an executor spins it; callbacks run in that executor's thread.
-        on_notice: called with each text that arrives, our own too.
+    The topic's name holds no system: a supervisor that was started with another manifest must be
+    noticed too. Callbacks run in the executor that spins `node`.
     """
 
     def __init__(self, node: Node, on_notice: Callable[[str], None]) -> None:
@@ -269,3 +271,124 @@ class PlanNotices:
         """Announce again: Fast DDS repeats what a newcomer lost after up to 3 s."""
         if info.current_count_change > 0 and self._text:
             self._publisher.publish(String(data=self._text))
+
+
+_DIAGNOSTICS = QoSProfile(depth=10)
+"""Reliable and volatile, as rclpy has it by default."""
+
+_LAST = Duration(nanoseconds=200_000_000)
+"""Within so long who is there has acknowledged what was published last: a round trip or two."""
+
+Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
+"""Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
+
+
+@typing.final
+class RosInterface:
+    """The topics and services of one supervisor; `destroy` it before its node.
+
+    Args:
+        node: an executor spins it.
+        prefix: under which the status topic and the services are, `/lifecycle/patrol`.
+        services: names of the services.
+        on_call: called in the executor's thread with the name of a service that is called and with
+            what answers the call (success, message), which may be called once from any thread.
+        diagnoses: publish on /diagnostics, too.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        prefix: str,
+        services: Iterable[str],
+        on_call: Callable[[str, Callable[[bool, str], None]], None],
+        *,
+        diagnoses: bool = True,
+    ) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from std_srvs.srv import Trigger
+
+        self._node = node
+        self._on_call = on_call
+        # Others are served while one call waits for its answer.
+        group = ReentrantCallbackGroup()
+        # rclpy's own methods, as everywhere on an observer's node.
+        self._status = Node.create_publisher(
+            node,
+            String,
+            supervisor_status_topic(prefix),
+            latched(1),
+            event_callbacks=_no_publisher_events(),
+        )
+        self._diagnostics = (
+            Node.create_publisher(
+                node,
+                DiagnosticArray,
+                DIAGNOSTICS_TOPIC,
+                _DIAGNOSTICS,
+                event_callbacks=_no_publisher_events(),
+            )
+            if diagnoses
+            else None
+        )
+        self._services = tuple(
+            Node.create_service(
+                node, Trigger, f"{prefix}/{name}", self._served(name), callback_group=group
+            )
+            for name in services
+        )
+        if node.executor is not None:
+            node.executor.wake()
+
+    def publish_status(self, text: str) -> None:
+        """Publish the status to present and later subscribers."""
+        self._status.publish(String(data=text))
+
+    def publish_diagnostics(self, entries: Iterable[Entry]) -> None:
+        """Publish diagnostics, if anything subscribes to them."""
+        if self._diagnostics is None or not self._diagnostics.get_subscription_count():
+            return
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=bytes([level]),
+                name=name,
+                message=text,
+                hardware_id=hardware_id,
+                values=[KeyValue(key=key, value=value) for key, value in values],
+            )
+            for level, name, text, hardware_id, values in entries
+        ]
+        self._diagnostics.publish(message)
+
+    def destroy(self) -> None:
+        """Offer and publish nothing any more; what was published last has arrived, if it can."""
+        for service in self._services:
+            Node.destroy_service(self._node, service)
+        for publisher in (self._status, self._diagnostics):
+            if publisher is None:
+                continue
+            if publisher.get_subscription_count():
+                publisher.wait_for_all_acked(_LAST)
+            Node.destroy_publisher(self._node, publisher)
+
+    def _served(self, name: str) -> Callable[[Any, Any], Any]:
+        async def serve(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            del request
+            answered: Future = Future()
+
+            def answer(success: bool, message: str) -> None:
+                response.success, response.message = success, message
+                answered.set_result(None)
+                with contextlib.suppress(InvalidHandle):
+                    if self._node.executor is not None:
+                        self._node.executor.wake()
+
+            self._on_call(name, answer)
+            await answered
+            return response
+
+        return serve

@@ -1,7 +1,4 @@
-"""QoS profiles and message, service and action types: the manifest's names as rclpy's objects.
-
-Owns: the conversion of QoS both ways; from `package/msg/Type` to the Python class and its type
-support, and the message that says what is wrong with a name.
+"""QoS profiles, interface types and parameters: the manifest's names and values as rclpy's objects.
 
 Policies go by name: both sides use rmw's. Infinite durations are None on our side; rmw spells them
 RMW_DURATION_UNSPECIFIED (0, what a default profile holds) or RMW_DURATION_INFINITE (what discovery
@@ -10,12 +7,14 @@ shows), which mean the same on Fast DDS.
 
 from __future__ import annotations
 
+import array
 import importlib
 import re
 import warnings
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.parameter import Parameter
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -26,6 +25,7 @@ from rclpy.qos import (
 from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 
 _UNSPECIFIED_NS = 0
@@ -33,11 +33,7 @@ _INFINITE_NS = 2**63 - 1
 
 
 def latched(depth: int) -> QoSProfile:
-    """Return rclpy's profile whose last samples DDS keeps for subscriptions that come later.
-
-    Args:
-        depth: samples, ≥ 1.
-    """
+    """Return a profile whose last samples DDS keeps for subscriptions that come later."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
@@ -140,3 +136,45 @@ def load_type_support(name: str) -> None:
         check_is_valid_msg_type(found)
     elif "/srv/" in name:
         check_is_valid_srv_type(found)
+
+
+PARAMETER_TYPES = {
+    "bool": Parameter.Type.BOOL,
+    "int": Parameter.Type.INTEGER,
+    "double": Parameter.Type.DOUBLE,
+    "string": Parameter.Type.STRING,
+    "byte_array": Parameter.Type.BYTE_ARRAY,
+    "bool_array": Parameter.Type.BOOL_ARRAY,
+    "int_array": Parameter.Type.INTEGER_ARRAY,
+    "double_array": Parameter.Type.DOUBLE_ARRAY,
+    "string_array": Parameter.Type.STRING_ARRAY,
+}
+"""Our type name → rclpy's type, whose value is rcl_interfaces/msg/ParameterType's."""
+
+_WORDS = {each.value: word for word, each in PARAMETER_TYPES.items()}
+
+
+def type_word(type_: int) -> str:
+    """Return our name of a rcl_interfaces/msg/ParameterType; empty for one that is not set."""
+    return _WORDS.get(type_, "")
+
+
+def parameter_value(value: Any) -> ParameterValue | None:
+    """Return a value as rclpy has it in our types: arrays are tuples, bytes are integers."""
+    if isinstance(value, (bytes, list, tuple, array.array)):
+        return tuple(each[0] if isinstance(each, bytes) else each for each in value)
+    plain: ParameterValue | None = value
+    return plain
+
+
+def parameter_to_rclpy(value: ParameterValue, type_: str) -> Any:
+    """Return a value as rclpy wants it: YAML writes 5 for a double, and bytes as integers."""
+    if isinstance(value, tuple):
+        if type_ == "double_array":
+            return [float(each) for each in value]
+        if type_ == "byte_array":
+            return [bytes((int(each),)) for each in value]
+        return list(value)
+    if type_ == "double" and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value

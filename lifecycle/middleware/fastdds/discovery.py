@@ -1,14 +1,18 @@
-"""Where participants are looked for: by discovery settings in the environment and by URLs.
+"""Where participants are looked for: by settings in the environment, by URLs, by a server.
 
 Owns: which UDP ports a participant of this process asks in order to find others, and where it
 cannot ask: over shared memory and TCP, behind a discovery server, and where the user's own settings
-of Fast DDS choose transports or peers. Must not import rclpy.
+of Fast DDS choose transports or peers; the command line and environment of
+`fast-discovery-server`, and whether one listens. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
+import os
+import shutil
+import sysconfig
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -21,16 +25,21 @@ from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     default_profile,
 )
-from lifecycle.middleware.fastdds.sockets import open_sockets, udp_sockets
+from lifecycle.middleware.fastdds.sockets import (
+    interface_addresses,
+    open_sockets,
+    sockets_in,
+    udp_sockets,
+)
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
     families,
     leaves_discovery_open,
 )
-from lifecycle.middleware.process.control import interface_addresses
+from lifecycle.middleware.versions import DISTRIBUTIONS, INSTALL, installed
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
+from lifecycle.network.medium import DEFAULT_TCP, RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
 from lifecycle.network.nfe import parse_address
 from lifecycle.network.ports import (
     DG,
@@ -39,6 +48,7 @@ from lifecycle.network.ports import (
     participant_ports,
     unicast_pairs,
 )
+from lifecycle.plan.model import PlannedServer
 
 SETTLE_S = 3.5
 """Within so long everybody is known: Fast DDS announces itself, and sends again what was lost, each
@@ -99,9 +109,9 @@ def reach(
     Args:
         domain_id: 0–232.
         urls: its own; none for what the RMW does by itself.
-        environment: where ROS_AUTOMATIC_DISCOVERY_RANGE is looked up, for URLs that leave discovery
-            open. OFF asks nobody, SUBNET (the default) this host, by multicast, and those of
-            ROS_STATIC_PEERS, everything else this host only.
+        environment: has ROS_AUTOMATIC_DISCOVERY_RANGE, for URLs that leave discovery open. OFF asks
+            nobody, SUBNET (the default) this host, by multicast, and those of ROS_STATIC_PEERS,
+            everything else this host only.
 
     Returns:
         One per address family; none where others cannot be asked, or may only be from one port.
@@ -158,10 +168,7 @@ def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] 
 
 
 def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
-    """Return the ports of this process on which participants receive discovery.
-
-    Read from the kernel, never inferred: a taken port moves a participant to another one.
-    """
+    """Return the ports of this process on which participants receive discovery, as bound."""
     ports = participant_ports(domain_id, 0)
     possible = range(ports.discovery_unicast, ports.discovery_multicast + DG, 2)
     return tuple(sorted({e.port for e in open_sockets() if e.kind == kind and e.port in possible}))
@@ -223,10 +230,10 @@ def missing_port(
 
 
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:
-    """Whether the user's own settings of Fast DDS say how participants without URLs are found.
+    """Whether the user's own settings say how participants without URLs are found.
 
-    A discovery server, transports, or where to look for others: then nothing may be asked over
-    UDP, which those settings may have ruled out. An RMW without DDS has nothing that answers.
+    Then nothing may be asked over UDP, which those settings may have ruled out. An RMW without DDS
+    has nothing that answers.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return True
@@ -239,8 +246,7 @@ def chosen_otherwise(environment: Mapping[str, str]) -> bool:
 def _connects_first(environment: Mapping[str, str]) -> bool:
     """Return whether participants, once discovered, make TCP connections before they say more.
 
-    So it is with LARGE_DATA, where the range does not choose other transports, and with a file of
-    profiles that has TCP. An answer by UDP says nothing then of what a participant has.
+    An answer by UDP says nothing then of what a participant has.
     """
     builtin = environment.get(TRANSPORTS_VARIABLE, "").upper()
     if builtin.startswith("LARGE_DATA") and _range(environment) != "LOCALHOST":
@@ -275,10 +281,9 @@ def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
-    """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
+    """Return ROS_STATIC_PEERS, which rmw reads, with these hosts beside those of the user's.
 
-    Participants without UDP over IPv4 would look for no others then, so where the user's settings
-    take it away, nothing is added.
+    Nothing is added for participants without UDP over IPv4: they would look for no others then.
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
@@ -289,15 +294,12 @@ def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> M
 def discovery_peers(
     domain_id: int, hosts: Mapping[str, int], environment: Mapping[str, str]
 ) -> tuple[tuple[str, int], ...]:
-    """Return where participants of these hosts are looked for, beside multicast.
+    """Return addresses and UDP ports where participants are looked for, multicast among them.
 
     Args:
         domain_id: 0–232.
         hosts: by IP address, how many participants may be there.
-        environment: where settings of Fast DDS are looked up.
-
-    Returns:
-        Addresses and UDP ports; nothing where the user's own settings say how others are found.
+        environment: if it says how others are found, nothing is returned.
     """
     if not hosts or chosen_otherwise(environment):
         return ()
@@ -308,3 +310,67 @@ def discovery_peers(
     ]
     group = participant_ports(domain_id, 0).discovery_multicast
     return ((DISCOVERY_GROUP[RMW_DISCOVERY], group), *found)
+
+
+_PROGRAM = "fast-discovery-server"
+_LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
+
+
+def discovery_server_command(
+    server: PlannedServer, environment: Mapping[str, str] | None = None
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the command line of a discovery server on this host, and its whole environment.
+
+    Args:
+        server: address, port and transport.
+        environment: what it otherwise gets; None for this process's.
+
+    Raises:
+        MiddlewareError: the program is not installed.
+    """
+    options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
+    command = (_program(), *installed().server_arguments)
+    argv = (*command, "-i", "0", *options, str(server.port))  # the id that clients expect
+    current = dict(os.environ if environment is None else environment)
+    # A profile or a server of the environment's would be applied to the server itself.
+    for variable in (
+        *(each.profiles_variable for each in DISTRIBUTIONS),
+        TRANSPORTS_VARIABLE,
+        DISCOVERY_SERVER_VARIABLE,
+    ):
+        current.pop(variable, None)
+    current["SKIP_DEFAULT_XML"] = "1"
+    paths = [*_library_paths(), *filter(None, current.get("LD_LIBRARY_PATH", "").split(":"))]
+    current["LD_LIBRARY_PATH"] = ":".join(dict.fromkeys(paths))
+    return argv, current
+
+
+def discovery_server_listens(server: PlannedServer, pid: int | None = None) -> bool:
+    """Return whether the server's port is open in the network of a process, None for ours."""
+    owner, name = "self" if pid is None else str(pid), "tcp" if server.tcp else "udp"
+    table, kind = Path("/proc", owner, "net", name), DEFAULT_TCP if server.tcp else RMW_DISCOVERY
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return any(
+            each.port == server.port
+            and each.address in (server.address, kind.any_address)
+            and (not server.tcp or state == _LISTEN)
+            for each, state in sockets_in(table, kind)
+        )
+    return False
+
+
+def _program() -> str:
+    for directory in (sysconfig.get_path("scripts"), None):
+        found = shutil.which(_PROGRAM, path=directory)
+        if found is not None:
+            return found
+    raise MiddlewareError(
+        f"cannot find {_PROGRAM!r}", hint=f"it comes with Fast DDS; set PATH, or {INSTALL}"
+    )
+
+
+def _library_paths() -> list[str]:
+    """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
+    data, pure = (Path(sysconfig.get_path(each)) for each in ("data", "purelib"))
+    places = (data / "lib", pure / "ros_fastrtps.libs", pure / "ros_fastdds.libs")
+    return [str(place) for place in places if place.is_dir()]

@@ -1,1 +1,0 @@
-"""DDS discovery: range, discovery server, the prober, liveliness, TCP, names."""
