@@ -19,7 +19,7 @@ import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import EndpointKind, NodeDeclaration, RosInterfaceAccess
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import quote
 
 # rcl's lexer: a token has no two underscores in a row and does not start with a digit.
 _WORD = r"(?![0-9])(?:(?!__)[A-Za-z0-9_])+"

@@ -20,19 +20,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 import msgspec
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
 from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.names import namespace_problem, node_name_problem
-from lifecycle.manifest.yaml.document import error, spell_place
-from lifecycle.manifest.yaml.source import decode, read_bytes
-from lifecycle.manifest.yaml.yaml_parser import (
-    INT64_MAX,
-    INT64_MIN,
-    MAX_VALUES,
-    events,
-    not_finite,
-    quote,
-)
+from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, not_finite, quote, spell_place
+from lifecycle.manifest.yaml.source import MAX_VALUES, decode, events, read_bytes
 
 if TYPE_CHECKING:
     import yaml

@@ -11,7 +11,7 @@ from lifecycle.manifest.checks.system import (
     read_rule,
     usable_rules,
 )
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, note, warning
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Node
 from lifecycle.manifest.names import (
     RemapKind,
@@ -24,7 +24,6 @@ from lifecycle.manifest.names import (
     parse_rule,
     remap_kind,
 )
-from lifecycle.manifest.yaml.document import error, note, warning
 
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
 

@@ -14,16 +14,15 @@ from typing import NamedTuple
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.interface import nearest_file
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
-from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.parameter_files import (
     ParameterFile,
     read_scalar,
     type_of,
 )
-from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import quote
 
 _IMPLICIT = ("use_sim_time", "start_type_description_service")
 
