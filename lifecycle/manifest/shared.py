@@ -189,10 +189,8 @@ def _settled(node: Node, files: ParameterFiles) -> Node:
         kept = {name for name in shared if name in declared or is_implicit(name)}
     else:
         kept = set(shared)
-    for path in node.parameter_files if kept else ():
-        for section in files.read(path).sections:
-            if section.matches(node.full_name):
-                kept -= {name for name, _, _ in section.parameters}
+    if kept:
+        kept -= {name for name, _, _ in files.given(node)}
     gone = shared - kept
     return replace(
         node,

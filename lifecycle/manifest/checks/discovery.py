@@ -54,16 +54,13 @@ _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 
 def check_discovery(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about discovery and the data layer's authority."""
-    discovery = system.manifest.discovery
-    section = system.manifest.positions.get("discovery")
-    if section is not None:
-        yield from _range(system, section)
-        yield from _addresses(system, section)
-        yield from _transport(system, section)
-        yield from _server(system, section)
-        yield from _rmws(system, section)
-        for node in system.manifest.nodes:
-            yield from _foreign_rmws(discovery, node)
+    yield from _range(system)
+    yield from _addresses(system)
+    yield from _transport(system)
+    yield from _server(system)
+    yield from _rmws(system)
+    for node in system.manifest.nodes:
+        yield from _foreign_rmws(system.manifest.discovery, node)
     yield from _authority(system)
 
 
@@ -71,9 +68,9 @@ def _mode(discovery: Discovery) -> str:
     return f"discovery mode {discovery.mode.value}"
 
 
-def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _range(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
-    at = system.manifest.where("discovery.range", section)
+    at = system.manifest.where("discovery.range")
     if (
         discovery.mode is not DiscoveryMode.DYNAMIC
         and discovery.range is not DiscoveryRange.SYSTEM_DEFAULT
@@ -85,10 +82,10 @@ def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-range", at, message, "remove 'range'")
 
 
-def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _addresses(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Judge addresses that others must know beforehand."""
     discovery, found = system.manifest.discovery, system.hosts
-    at = system.manifest.where("discovery.mode", section)
+    at = system.manifest.where("discovery.mode")
     if discovery.mode is DiscoveryMode.DYNAMIC or len(found) < 2:
         return
     for machine in found.get("", ()):
@@ -116,9 +113,9 @@ def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
         yield error("check.discovery-address", at, message, hint)
 
 
-def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _transport(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
-    at = system.manifest.where("discovery.transport", section)
+    at = system.manifest.where("discovery.transport")
     transport, found = discovery.transport, system.hosts
     medium = transport.medium
     rule, what = "check.discovery-transport", f"cannot let discovery use {transport.value} alone"
@@ -149,10 +146,10 @@ def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
             yield error(rule, machines[0].at, message, hint)
 
 
-def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _server(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     name = discovery.server_machine
-    at = system.manifest.where("discovery.server_machine", section)
+    at = system.manifest.where("discovery.server_machine")
     if not name:
         return
     if discovery.mode is not DiscoveryMode.SERVER:
@@ -172,11 +169,11 @@ def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-server", at, message, "choose a machine that runs a node")
 
 
-def _rmws(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _rmws(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Only Fast DDS can be configured so; a server serves only its own kind."""
     discovery = system.manifest.discovery
     dynamic = discovery.mode is DiscoveryMode.DYNAMIC
-    at = system.manifest.where(f"discovery.{'transport' if dynamic else 'mode'}", section)
+    at = system.manifest.where(f"discovery.{'transport' if dynamic else 'mode'}")
     if dynamic and discovery.transport is FlowTransport.ANY:
         return
     by_rmw: dict[str, list[str]] = {}
@@ -226,16 +223,13 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
 
 def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
     layer = system.manifest.data_layer
-    section = system.manifest.positions.get("data_layer")
-    if section is None:
-        return
     if layer.authority is Authority.NODES and layer.source is DataLayerSource.DYNAMIC:
         message = (
             "cannot make the data layer graph from node configurations under authority 'nodes': "
             "each node only follows what it was started with, and nobody would negotiate"
         )
         hint = "use 'authority: supervisor', or 'source: static'"
-        at = system.manifest.where("data_layer.source", section)
+        at = system.manifest.where("data_layer.source")
         yield error("check.authority", at, message, hint)
     if layer.authority is not Authority.SUPERVISOR:
         return
@@ -420,7 +414,8 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         # One that is no domain is the environment's fault, and refused where it is used.
         domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
-    at = system.manifest.where("discovery", start)
+    section = system.manifest.positions.get("discovery")
+    at = section or start
     try:
         room = max_participants(domain, LINUX).participants
     except ValueError as problem:  # of a manifest that was made by code
@@ -435,7 +430,7 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         )
         yield note("check.domain", at, message, f"use domain {domains}")
     for host in system.hosts.values():
-        yield from _crowded(system, host, domain, system.manifest.where("discovery", host[0].at))
+        yield from _crowded(system, host, domain, section or host[0].at)
         yield from _beyond_localhost(system, host)
 
 
@@ -524,7 +519,8 @@ def _beyond_localhost(system: DeclaredSystem, host: list[Machine]) -> Iterator[D
         f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
     )
     hint = "use 'range: subnet', or give several nodes one 'process:'"
-    yield error("check.localhost", system.manifest.where("discovery", nodes[0].at), message, hint)
+    at = system.manifest.positions.get("discovery", nodes[0].at)
+    yield error("check.localhost", at, message, hint)
 
 
 def _participants(nodes: list[Node], system: DeclaredSystem) -> int:

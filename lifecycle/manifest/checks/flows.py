@@ -30,8 +30,8 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for transports."""
     mapping = system.manifest.network.transport_priority_mapping
-    at = system.manifest.positions.get("network.transport_priority_mapping")
-    if mapping is not None and at is not None and mapping.low > mapping.high:
+    if mapping is not None and mapping.low > mapping.high:
+        at = system.manifest.where("network.transport_priority_mapping")
         message = f"cannot map priorities to TOS {mapping.low:#x} … {mapping.high:#x}"
         yield error("check.flow-dscp", at, message, "the highest is below the lowest: swap them")
     for node in system.manifest.nodes:

@@ -153,16 +153,13 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
     hint = "write 'pause' or 'stop', which are for the whole system"
     for node in system.manifest.nodes:
         for each in node.on_violation:
+            at = node.where(f"on_violation.{each.rule}")
             if each.what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
                 message = f"cannot deactivate {node.key!r} when it violates: {why}"
-                at = node.where(f"on_violation.{each.rule}")
                 yield error("check.on-violation", at, message, hint)
-        for each in node.on_violation:
-            yield from _mode(system, each, node.where(f"on_violation.{each.rule}"))
+            yield from _mode(system, each, at)
     for each in system.manifest.on_violation:
-        top = Position(file=system.manifest.path, line=1, column=1)
-        place = system.manifest.where(f"on_violation.{each.rule}", top)
-        yield from _mode(system, each, place)
+        yield from _mode(system, each, system.manifest.where(f"on_violation.{each.rule}"))
 
 
 def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:

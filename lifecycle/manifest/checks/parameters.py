@@ -132,13 +132,7 @@ def _empty_arrays(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
         for each in command_line_parameters(node)
         if each.name and each.node in ("", node.name)
     ]
-    given += [
-        each
-        for path in node.parameter_files
-        for section in system.files.read(path).sections
-        if section.matches(node.full_name)
-        for each in section.parameters
-    ]
+    given += system.files.given(node)
     for name, value, at in given:
         if value == ():
             message = f"cannot tell the type of {name!r} of {node.key!r}: [] has none in ROS"
@@ -196,13 +190,7 @@ def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
         return True
     if any(each.name == name and each.default is not None for each in node.interface.parameters):
         return True
-    return any(
-        name == found
-        for path in node.parameter_files
-        for section in system.files.read(path).sections
-        if section.matches(node.full_name)
-        for found, _, _ in section.parameters
-    )
+    return any(name == found for found, _, _ in system.files.given(node))
 
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:
