@@ -12,14 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle.manifest import written
-from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import (
-    Findings,
-    build_inline,
-    build_parameters,
-    flat_parameters,
-    parameter_value,
-)
+from lifecycle.manifest.diagnostics import Diagnostic, Findings, Position, error
+from lifecycle.manifest.interface import build_inline, read_interface
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     PROCESS_KEYS,
@@ -50,11 +44,9 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
-from lifecycle.manifest.nodl import read_interface
-from lifecycle.manifest.shared import Shared
+from lifecycle.manifest.shared import Shared, build_parameters, flat_parameters, parameter_value
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, error
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import Document, quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
 _KINDS = {kind.value: kind for kind in EndpointKind}

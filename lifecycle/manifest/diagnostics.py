@@ -76,6 +76,25 @@ class Diagnostic(msgspec.Struct, frozen=True, kw_only=True):
         return f"{place}{word}{path}{self.message}" + (f"; {self.hint}" if self.hint else "")
 
 
+Findings = list[Diagnostic]
+"""Findings in the order of detection; every builder appends and continues."""
+
+
+def error(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
+    """Make an error; `message` starts with "cannot"."""
+    return Diagnostic(rule=rule, severity=Severity.ERROR, at=at, message=message, hint=hint)
+
+
+def warning(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
+    """Make a warning: something that is declared is in doubt; `message` starts with "cannot"."""
+    return Diagnostic(rule=rule, severity=Severity.WARNING, at=at, message=message, hint=hint)
+
+
+def note(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
+    """Make a note: advice, with nothing in doubt that is declared; `message` as of a warning."""
+    return Diagnostic(rule=rule, severity=Severity.NOTE, at=at, message=message, hint=hint)
+
+
 def in_order(found: Iterable[Diagnostic], files: Iterable[str]) -> tuple[Diagnostic, ...]:
     """Return findings once each, by file, then by position.
 

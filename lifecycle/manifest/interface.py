@@ -1,19 +1,36 @@
-"""Validated interfaces → endpoints and parameter declarations, of manifests and NoDL documents.
+"""Interfaces → endpoints and parameter declarations: written out, or in NoDL v2 documents.
 
-Owns: `build_inline`: what a QoS profile is with presets and defaults, declared defaults of
-parameters in their types; values that are given to parameters, flat. Pure.
+Owns: what a QoS profile is with presets and defaults, declared defaults of parameters in their
+types; references (`local://relative/path`, `nodl://package/name`) with the documents they include,
+and what of NoDL differs from an inline interface: types without their kind, policies that must be
+written, types of generate_parameter_library. The format is nodl.schema.yaml of ros-tooling/nodl 2.0
+and parameter.schema.yaml. What is not used of it is a warning; what breaks it is an error.
 """
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.codec import Octet
+from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import (
+    Diagnostic,
+    Findings,
+    ManifestError,
+    Position,
+    Severity,
+    error,
+    warning,
+)
+from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
 from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
@@ -28,12 +45,14 @@ from lifecycle.manifest.qos import (
     QosProfile,
     not_written,
 )
+from lifecycle.manifest.schema import validate
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, error, note
-from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
-
-Findings = list[Diagnostic]
-"""Findings in the order of detection; every builder appends and continues."""
+from lifecycle.manifest.yaml.document import (
+    Document,
+    Value,
+    quote,
+)
+from lifecycle.manifest.yaml.source import read_document
 
 _DEFAULT_PRESET = {
     EndpointKind.PUBLISHER: "default",
@@ -148,60 +167,251 @@ def _default(part: Document, type_: str, found: Findings) -> ParameterValue | No
     return value
 
 
-def build_parameters(node: Document, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
-    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
-    return flat_parameters(node.entries("parameters"), found)
+NODL_VERSION = 2
+
+_NOT_OURS = ("nodl_version", "description", "codegen", "include")
+_UNCHECKED = ("additional_constraints", "validation")
+_PARAMETER_KEYS = ("type", "default_value", "description", "read_only")
+_FIXED_SIZE = re.compile(r"(string|int_array|double_array|string_array)_fixed_[1-9][0-9]*")
 
 
-def flat_parameters(
-    entries: Iterable[tuple[str, Document]], found: Findings
-) -> dict[str, tuple[ParameterValue, Position]]:
-    """Return values by dotted name, and where each is written."""
-    flat: dict[str, tuple[ParameterValue, Position]] = {}
-    pending = list(reversed(list(entries)))
-    while pending:
-        name, part = pending.pop()
-        if isinstance(part.root.data, dict):
-            inner = [(f"{name}.{key}", each) for key, each in part.entries()]
-            pending.extend(reversed(inner))
-            continue
-        if name in flat:
-            message = f"cannot set the parameter {name!r} twice"
-            first = flat[name][1]
-            hint = f"the first value stands at {first.spelled}"
-            found.append(error("manifest.duplicate-parameter", part.at(), message, hint))
-            continue
-        value = parameter_value(name, part, found)
-        if value is not None:
-            flat[name] = (value, part.key_at())
-    return flat
+def _text(value: Value, text: str) -> Value:
+    return replace(value, data=text, text=text)
 
 
-def parameter_value(name: str, part: Document, found: Findings) -> ParameterValue | None:
-    """Return the value of a parameter or argument; None after reporting that it cannot be one."""
-    if isinstance(part.root.data, tuple):
-        return _scalar_tuple(part, found)
-    text = part.root.text
-    if not part.root.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
-        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
-        hint = f'write {name}: true or false, or {name}: "{text}"'
-        found.append(note("manifest.yaml-1.1-boolean", part.at(), message, hint))
-    if not part.root.quoted and has_leading_zero(text):
-        message = f"cannot tell which number {text} is meant as; it is read as a string"
-        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
-        found.append(note("manifest.leading-zero", part.at(), message, hint))
-    return part.scalar
+MAX_DOCUMENTS = 100
+"""Documents that one reference may pull in."""
+
+_RESOURCE = "nodl"  # ament_nodl_register() installs documents as nodl/<package>__<name>
 
 
-def _scalar_tuple(part: Document, found: Findings) -> tuple[bool | int | float | str, ...] | None:
-    """Return a ROS array; None after reporting that its items differ in type."""
-    values = part.plain()
-    types = {type(each).__name__: each for each in values}
-    if len(types) == 1 or not values:
-        return tuple(values)
-    names = {"str": "string", "float": "double"}
-    spelled = " and ".join(f"{names.get(name, name)} {quote(each)}" for name, each in types.items())
-    message = f"cannot mix {spelled} in one array; a ROS array holds one type"
-    hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
-    found.append(error("manifest.parameter-array", part.at(), message, hint))
-    return None
+def read_interface(
+    reference: str,
+    *,
+    base: str | Path,
+    at: Position,
+    environment: Mapping[str, str] | None = None,
+) -> tuple[Interface, tuple[Diagnostic, ...]]:
+    """Read the interface that a reference names, with everything it includes.
+
+    Args:
+        reference: `local://PATH`, relative to `base`, or `nodl://PACKAGE/NAME` in the ament index.
+        base: directory of the document that holds the reference.
+        at: where that document holds it.
+        environment: for AMENT_PREFIX_PATH; this process's if None.
+
+    Returns:
+        The interface, with `source` set, and every finding. After an error the interface holds
+        what could be read.
+    """
+    reading = _NodlReading(search_prefixes(environment))
+    reading.follow(reference, Path(base), at, ())
+    reading.report_collisions()
+    interface = Interface(
+        endpoints=tuple(reading.endpoints),
+        parameters=tuple(reading.parameters),
+        source=reference,
+        has_all_parameters=True,
+    )
+    return interface, tuple(reading.found)
+
+
+class _NodlReading:
+    """One walk over a document and its includes; collects entities and findings."""
+
+    def __init__(self, prefixes: tuple[Path, ...]) -> None:
+        self._prefixes = prefixes
+        self._read: set[Path] = set()
+        self.endpoints: list[Endpoint] = []
+        self.parameters: list[ParameterDeclaration] = []
+        self.found: list[Diagnostic] = []
+
+    def follow(self, reference: str, base: Path, at: Position, chain: tuple[Path, ...]) -> None:
+        """Read one reference; `chain` holds the documents that led to it."""
+        path = self._locate(reference, base, at)
+        if path is None:
+            return
+        identity = path.resolve()
+        if identity in chain:
+            names = " → ".join(each.name for each in (*chain[chain.index(identity) :], identity))
+            self._error("cycle", at, f"cannot include {reference!r} in itself: {names}")
+            return
+        if identity in self._read:
+            self._error("twice", at, f"cannot include {reference!r} twice", "remove one include")
+            return
+        if len(self._read) == MAX_DOCUMENTS:
+            self._error("limit", at, f"cannot include more than {MAX_DOCUMENTS} documents")
+            return
+        self._read.add(identity)
+        try:
+            document = read_document(path)
+        except ManifestError as problem:
+            self.found += problem.diagnostics
+            return
+        interface = self._interface(document)
+        self.endpoints += interface.endpoints
+        self.parameters += interface.parameters
+        includes = document.get("include")
+        if includes is not None and not isinstance(includes.root.data, tuple):
+            self._error("invalid", includes.at(), "cannot include what is no list")
+            return
+        for each in document.items("include"):
+            if ref := each.text("ref"):
+                self.follow(ref, path.parent, each.at(("ref",)), (*chain, identity))
+            else:
+                where = each.at(("ref",))
+                self._error("invalid", where, "cannot do without the key 'ref' in an include")
+
+    def _interface(self, document: Document) -> Interface:
+        """Return what a document declares, its includes left out; nothing after an error."""
+        before = len(self.found)
+        lists = [kind.value for kind in EndpointKind]
+        entries = self._known(document, [*_NOT_OURS, "parameters", *lists])
+        version = entries.get("nodl_version")
+        if version is None:
+            message = "cannot do without the key 'nodl_version'"
+            self._error("invalid", document.at(), message, "add 'nodl_version: 2'")
+        elif version.data != NODL_VERSION:
+            message = f"cannot use nodl_version {quote(version.data)}; allowed: {NODL_VERSION}"
+            self._error("invalid", document.at(("nodl_version",)), message)
+        for key in _NOT_OURS:
+            entries.pop(key, None)
+        for kind in EndpointKind:
+            if (each := entries.get(kind.value)) and isinstance(each.data, tuple):
+                data = tuple(self._endpoint(kind, part) for part in document.items(kind.value))
+                entries[kind.value] = replace(each, data=data)
+        if (each := entries.get("parameters")) and isinstance(each.data, dict):
+            declared = {
+                name: self._parameter(name, part) for name, part in document.entries("parameters")
+            }
+            known = {name: value for name, value in declared.items() if value is not None}
+            entries["parameters"] = replace(each, data=known)
+        inline = replace(document, root=replace(document.root, data=entries))
+        found = list(validate(inline, definition="Interface"))
+        interface = Interface() if found else build_inline(inline, found)
+        rules = {"manifest.duplicate-name": "nodl.duplicate"}
+        self.found += [replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found]
+        failed = any(each.severity is Severity.ERROR for each in self.found[before:])
+        return Interface() if failed else interface
+
+    def _endpoint(self, kind: EndpointKind, part: Document) -> Value:
+        """Return an endpoint as a manifest has it."""
+        if not isinstance(part.root.data, dict):
+            return part.root
+        known = ("name", "type", "description", *(() if kind.is_action else ("qos",)))
+        entries = self._known(part, known)
+        if (type_ := entries.get("type")) and type_.text.count("/") == 1:
+            word = "msg" if kind.is_topic else "action" if kind.is_action else "srv"
+            entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
+        if kind.is_topic and "qos" not in entries:
+            self._error("invalid", part.at(), f"cannot do without the key 'qos' in a {kind.noun}")
+        qos = part.get("qos") if "qos" in entries else None
+        if qos is not None and isinstance(qos.root.data, dict):
+            entries["qos"] = replace(qos.root, data=self._known(qos, POLICIES))
+            for name in ("history", "reliability"):
+                if name not in qos:
+                    message = f"cannot do without the key {name!r} in a QoS profile"
+                    self._error("invalid", qos.at(), message)
+            if qos.text("history") == "KEEP_LAST" and "depth" not in qos:
+                message = "cannot do without 'depth' under KEEP_LAST"
+                self._error("invalid", qos.at(), message, "add 'depth: 10'")
+        elif qos is not None:
+            message = f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping"
+            self._error("invalid", qos.at(), message)
+        return replace(part.root, data=entries)
+
+    def _parameter(self, name: str, part: Document) -> Value | None:
+        """Return a declaration as a manifest has it; None for what declares no parameter."""
+        if not isinstance(part.root.data, dict):
+            return part.root
+        entries = self._known(part, (*_PARAMETER_KEYS, *_UNCHECKED))
+        type_ = entries.get("type")
+        if type_ and (fixed := _FIXED_SIZE.fullmatch(type_.text)):
+            self._unchecked(part.at(("type",)), f"the size in type {type_.text!r}")
+            entries["type"] = _text(type_, fixed[1])
+        for key in _UNCHECKED:
+            if (unchecked := entries.pop(key, None)) and unchecked.data is not None:
+                self._unchecked(part.at((key,)), f"{key!r}")
+        if name.startswith("__map_") or ".__map_" in name:
+            self._unchecked(part.at(), f"the parameter map {name!r}")
+            return None
+        if type_ and type_.text == "none":
+            return None
+        return replace(part.root, data=entries)
+
+    def _known(self, part: Document, words: Iterable[str]) -> dict[str, Value]:
+        """Return the entries of a mapping that NoDL knows, and warn of the others."""
+        known, found = list(words), {}
+        for key, each in part.entries():
+            if key in known:
+                found[key] = each.root
+                continue
+            message = f"cannot use the key {key!r}: NoDL {NODL_VERSION} has none; it is ignored"
+            hint = did_you_mean(key, known)
+            self.found.append(warning("nodl.unknown-key", each.key_at(), message, hint))
+        return found
+
+    def _unchecked(self, at: Position, what: str) -> None:
+        message = f"cannot check {what}; parameters are checked by type only"
+        self.found.append(warning("nodl.unchecked", at, message))
+
+    def report_collisions(self) -> None:
+        """Refuse a name that two entries of one list declare (nodl.schema.yaml, `include`)."""
+        first: dict[tuple[str, str], Position] = {}
+        entries = [(each.kind.noun, each.name, each.at) for each in self.endpoints]
+        entries += [("parameter", each.name, each.at) for each in self.parameters]
+        for what, name, at in entries:
+            other = first.setdefault((what, name), at)
+            if other is not at:
+                place = f"{other.spelled}"
+                message = f"cannot declare {what} {name!r} twice; the first stands at {place}"
+                self._error("duplicate", at, message, "remove one")
+
+    def _locate(self, reference: str, base: Path, at: Position) -> Path | None:
+        scheme, _, body = reference.partition("://")
+        if scheme == "local" and body:
+            path = base / body
+            if not os.path.exists(path):
+                message = f"cannot find {reference!r}: there is no file {str(path)!r}"
+                hint = nearest_file(path)
+                self._error("not-found", at, message, hint)
+                return None
+            return path
+        if scheme == "nodl":
+            return self._indexed(reference, body, at)
+        message = f"cannot follow {reference!r}; write local://PATH or nodl://PACKAGE/NAME"
+        self._error("reference", at, message)
+        return None
+
+    def _indexed(self, reference: str, body: str, at: Position) -> Path | None:
+        package, _, name = body.partition("/")
+        if not package or not name or "/" in name:
+            self._error("reference", at, f"cannot follow {reference!r}; write nodl://PACKAGE/NAME")
+            return None
+        found = find_resource(_RESOURCE, f"{package}__{name}", self._prefixes)
+        if found is None:
+            known = [
+                "nodl://" + each.replace("__", "/", 1)
+                for each in list_resources(_RESOURCE, self._prefixes)
+            ]
+            message = f"cannot find {reference!r} in the ament index"
+            hint = did_you_mean(reference, known) or (
+                f"source the workspace that installs {package}, so that AMENT_PREFIX_PATH names it"
+            )
+            self._error("not-found", at, message, hint)
+        return found
+
+    def _error(self, rule: str, at: Position, message: str, hint: str = "") -> None:
+        self.found.append(error(f"nodl.{rule}", at, message, hint))
+
+
+def nearest_file(path: Path) -> str:
+    """Return a hint that names the file, beside one that is missing, with the nearest name.
+
+    Only files of the same kind count, and only up to the first dot, where kinds begin.
+    """
+    stem, _, kind = path.name.partition(".")
+    files = [each.name.partition(".") for each in path.parent.glob(f"*.{kind}")]
+    stems = {each: f"{each}{dot}{rest}" for each, dot, rest in files if rest == kind}
+    found = nearest(stem, sorted(stems))
+    return f"did you mean {stems[found]!r}?" if found else ""

@@ -1,11 +1,9 @@
 """Load a manifest file: parse, substitute, validate, build, add includes, check. The entry point.
 
 Owns: `load`: the run of source → arguments and schema → build for a manifest and everything it
-includes, then of the checks. Documents and groups are walked from the outside in; each node is
-built with what is around it (`Shared`). A phase that finds errors reports all that it finds and is
-the last one. It is imported when `load` is asked for: a process that hosts a node needs a
-manifest's types, but never YAML nor JSON Schema, and those are half of what it would import.
-Touches the file system; needs no ROS.
+includes, then of the checks; which files `include:` names. Documents and groups are walked from the
+outside in; each node is built with what is around it (`Shared`). A phase that finds errors reports
+all that it finds and is the last one.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ from types import MappingProxyType
 import msgspec
 from msgspec.structs import replace
 
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.building import (
     build_modes,
     build_node,
@@ -25,13 +24,16 @@ from lifecycle.manifest.building import (
     positions_of,
     quantities,
 )
-from lifecycle.manifest.checks.registry import check
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import (
     Diagnostic,
+    Findings,
     ManifestError,
     Position,
     Severity,
+    error,
     in_order,
+    note,
 )
 from lifecycle.manifest.model import (
     DataLayer,
@@ -50,12 +52,10 @@ from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import THIS_HOST, Shared, settle
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import Substituted, substitute
-from lifecycle.manifest.yaml.document import Document, Place, Value, error, note
+from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
-from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.nfe import canonical, parse_address
 
 _NONE: Mapping[str, str] = MappingProxyType({})
@@ -266,7 +266,7 @@ class _Loading:
             entry: the include that names it; None for the outermost.
             around: what the including manifests and groups give its nodes.
         """
-        self.files.append(include.shown(path))
+        self.files.append(_shown(path))
         try:
             document = read_document(path, shown=self.files[-1])
         except ManifestError as problem:
@@ -402,13 +402,13 @@ class _Loading:
             )
 
     def _include(self, reading: _Reading, entry: Document, shared: Shared) -> None:
-        path = include.locate(entry, reading.chain, self.found)
+        path = _locate(entry, reading.chain, self.found)
         if path is None:
             return
         self._documents += 1
-        if self._documents > include.MAX_DOCUMENTS:
-            if self._documents == include.MAX_DOCUMENTS + 1:
-                message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
+        if self._documents > MAX_MANIFESTS:
+            if self._documents == MAX_MANIFESTS + 1:
+                message = f"cannot include more than {MAX_MANIFESTS} manifests"
                 self.found.append(error("manifest.include", entry.at(), message))
             return
         given = {name: each.root.text for name, each in entry.entries("arguments")}
@@ -476,3 +476,59 @@ def _keys_of(group: Value) -> Iterator[str]:
 
 def _has_errors(found: Iterable[Diagnostic]) -> bool:
     return any(each.severity is Severity.ERROR for each in found)
+
+
+MAX_INCLUDE_DEPTH = 16
+"""Manifests that include each other in a row."""
+
+MAX_MANIFESTS = 256
+"""Manifests of one system; included twice counts twice."""
+
+
+def _shown(path: Path) -> str:
+    """Return how messages name a file: bytes that are no UTF-8 could be neither _shown nor sent."""
+    return os.fsencode(path).decode("utf-8", errors="replace")
+
+
+def _identity(path: Path) -> str:
+    """Return a path without links, to recognise a file again."""
+    try:
+        return os.path.realpath(path)
+    except (OSError, ValueError):  # a name that no file can have; opening it reports that
+        return str(path)
+
+
+def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
+    """Return the file that an entry of `include:` names; None after reporting why there is none.
+
+    Args:
+        entry: the entry.
+        chain: the including manifests, outermost first.
+        found: findings are appended here.
+    """
+    name = entry.text("manifest")
+    path = Path(os.path.normpath(chain[-1].parent / name))
+    identities = [_identity(each) for each in chain]
+    message, hint = "", ""
+    if (identity := _identity(path)) in identities:
+        round_trip = [*chain[identities.index(identity) :], path]
+        names = " → ".join(each.name for each in round_trip)
+        message = f"cannot include {quote(name)}: it would include itself, {names}"
+    elif len(chain) == MAX_INCLUDE_DEPTH:
+        message = f"cannot include {quote(name)}: at most {MAX_INCLUDE_DEPTH} manifests in a row"
+    elif not os.path.exists(path):
+        message = f"cannot include {quote(name)}: there is no file {quote(str(path), limit=200)}"
+        hint = did_you_mean(path.name, _siblings(path))
+    elif path.is_dir():
+        message = f"cannot include {quote(name)}: it is a directory"
+    if not message:
+        return path
+    found.append(error("manifest.include", entry.at(("manifest",)), message, hint))
+    return None
+
+
+def _siblings(path: Path) -> list[str]:
+    try:
+        return sorted(os.listdir(path.parent))  # noqa: PTH208 - names, not paths
+    except (OSError, ValueError):  # no such folder, or not ours to read: there is no suggestion
+        return []

@@ -1122,6 +1122,8 @@ class Manifest(SystemDeclaration, frozen=True, kw_only=True):
     links: tuple[Link, ...] = ()
     left_out: tuple[str, ...] = ()
 
-    def where(self, path: str, section: Position) -> Position:
-        """Return the position of a value; that of its section where it is not written."""
+    def where(self, path: str) -> Position:
+        """Return the position of a value, else of its section; the file's start without either."""
+        start = Position(file=self.path, line=1, column=1)
+        section = self.positions.get(path.partition(".")[0], start)
         return self.positions.get(path, section)

@@ -2,10 +2,9 @@
 
 Owns: the rules of rmw_validate_node_name, rmw_validate_namespace, rmw_validate_full_topic_name,
 rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applies them; the grammar
-of a remap rule of `ros2 run … --ros-args -r RULE`, as rcl's argument parser has it
-(rcl/arguments.c, rcl/lexer.c): `[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`,
-`[node:]__ns:=/namespace`. plan/ resolves every endpoint through `resolve`. Also the
-services that every node has, and the names that a supervisor has in ROS. Pure.
+of a remap rule of `ros2 run … --ros-args -r RULE` (rcl/arguments.c, rcl/lexer.c):
+`[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`, `[node:]__ns:=/namespace`. Also
+the services that every node has, and the names that a supervisor has in ROS. Pure.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from __future__ import annotations
 import enum
 import functools
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping
 
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import EndpointKind, NodeDeclaration, RosInterfaceAccess
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import quote
 
 # rcl's lexer: a token has no two underscores in a row and does not start with a digit.
 _WORD = r"(?![0-9])(?:(?!__)[A-Za-z0-9_])+"
@@ -111,11 +110,11 @@ MAX_NAMESPACE_LENGTH = MAX_TOPIC_LENGTH - 2
 MAX_NODE_NAME_LENGTH = 255
 """RMW_NODE_NAME_MAX_NAME_LENGTH."""
 
-ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")
-"""Services under `<action>/_action/` (rcl_action/names.h)."""
-
-ACTION_TOPICS = ("feedback", "status")
-"""Topics under `<action>/_action/` (rcl_action/names.h)."""
+_OF_ACTIONS = (
+    *((each, EndpointKind.SERVICE_SERVER) for each in ("send_goal", "cancel_goal", "get_result")),
+    *((each, EndpointKind.PUBLISHER) for each in ("feedback", "status")),
+)
+"""Services and topics under `<action>/_action/` (rcl_action/names.h)."""
 
 _NOT_IN = {"": re.compile(r"[^A-Za-z0-9_]"), "/": re.compile(r"[^A-Za-z0-9_/]")}
 _SUBSTITUTION = re.compile(r"\{([^{}]*)\}")
@@ -123,7 +122,7 @@ _KNOWN_SUBSTITUTIONS = ("node", "ns", "namespace")
 
 
 def node_name_problem(name: str) -> str:
-    """Return why `name` is no node name, as a sentence without full stop; empty if it is legal."""
+    """Return why `name` is no node name, as a phrase; empty if it is legal."""
     length = len(name)
     return _first(
         (not name, "a node name must not be empty"),
@@ -151,8 +150,7 @@ def full_name_problem(name: str) -> str:
 def name_problem(name: str) -> str:
     """Return why `name` cannot name a topic, service or action in a node's code; empty if legal.
 
-    Relative, absolute and `~/private` names and the substitutions `{node}`, `{ns}` and
-    `{namespace}` are legal here.
+    Relative, absolute and `~/private` names and rcl's substitutions (`{node}`, `{ns}`) are legal.
     """
     plain = _SUBSTITUTION.sub("", name)
     unknown = [each for each in _SUBSTITUTION.findall(name) if each not in _KNOWN_SUBSTITUTIONS]
@@ -245,9 +243,19 @@ def resolve(
     """
     rules = [parse_rule(match, replacement) for match, replacement in remap]
     expanded = expand(name, node_name, namespace)
-    if kind.is_action:
-        return _resolve_action(name, expanded, rules, node_name, namespace)
-    return _remap(expanded, rules, remap_kind(kind), node_name, namespace)
+
+    def remapped(name: str, kind: EndpointKind) -> str:
+        for rule in rules:
+            if (
+                rule.applies_to(remap_kind(kind), node_name)
+                and expand(rule.match, node_name, namespace) == name
+            ):
+                return expand(rule.replacement, node_name, namespace)
+        return name
+
+    if not kind.is_action:
+        return remapped(expanded, kind)
+    return action_of(name, {each: remapped(each, of) for each, of in hidden_names(expanded)})
 
 
 def name_in_graph(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
@@ -267,42 +275,9 @@ def topic_of(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
         return ""
 
 
-def matching_rule(
-    expanded: str,
-    rules: Sequence[RemapRule],
-    kind: RemapKind,
-    *,
-    node_name: str,
-    namespace: str,
-) -> RemapRule | None:
-    """Return the rule that rcl applies to the fully qualified name `expanded`; None if none does.
-
-    Raises:
-        NameNotLegalError: a rule's `from` is not a legal name.
-    """
-    for rule in rules:
-        if (
-            rule.applies_to(kind, node_name)
-            and expand(rule.match, node_name, namespace) == expanded
-        ):
-            return rule
-    return None
-
-
 def hidden_names(action: str) -> tuple[tuple[str, EndpointKind], ...]:
-    """Return what an action server really offers: its hidden services, then its hidden topics.
-
-    Args:
-        action: name of the action, in any form.
-
-    Returns:
-        (name, kind) with SERVICE_SERVER or PUBLISHER, as the server's side has them.
-    """
-    services = (
-        (f"{action}/_action/{each}", EndpointKind.SERVICE_SERVER) for each in ACTION_SERVICES
-    )
-    topics = ((f"{action}/_action/{each}", EndpointKind.PUBLISHER) for each in ACTION_TOPICS)
-    return (*services, *topics)
+    """Return names and kinds of what an action server really offers: services, then topics."""
+    return tuple((f"{action}/_action/{each}", kind) for each, kind in _OF_ACTIONS)
 
 
 def action_of(name: str, resolved: Mapping[str, str]) -> str:
@@ -326,22 +301,6 @@ def action_of(name: str, resolved: Mapping[str, str]) -> str:
             hint="remap all five to one action name, or none",
         )
     return next(iter(actions.values()))
-
-
-def _remap(
-    expanded: str, rules: Sequence[RemapRule], kind: RemapKind, node_name: str, namespace: str
-) -> str:
-    rule = matching_rule(expanded, rules, kind, node_name=node_name, namespace=namespace)
-    return expanded if rule is None else expand(rule.replacement, node_name, namespace)
-
-
-def _resolve_action(
-    name: str, expanded: str, rules: Sequence[RemapRule], node_name: str, namespace: str
-) -> str:
-    resolved = {}
-    for hidden, kind in hidden_names(expanded):
-        resolved[hidden] = _remap(hidden, rules, remap_kind(kind), node_name, namespace)
-    return action_of(name, resolved)
 
 
 def _absolute_problem(name: str, what: str, longest: int) -> str:

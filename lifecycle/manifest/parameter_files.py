@@ -20,19 +20,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 import msgspec
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
-from lifecycle.manifest.model import ParameterValue
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
+from lifecycle.manifest.model import Node, ParameterValue
 from lifecycle.manifest.names import namespace_problem, node_name_problem
-from lifecycle.manifest.yaml.document import error, spell_place
-from lifecycle.manifest.yaml.source import decode, read_bytes
-from lifecycle.manifest.yaml.yaml_parser import (
-    INT64_MAX,
-    INT64_MIN,
-    MAX_VALUES,
-    events,
-    not_finite,
-    quote,
-)
+from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, not_finite, quote, spell_place
+from lifecycle.manifest.yaml.source import MAX_VALUES, decode, events, read_bytes
 
 if TYPE_CHECKING:
     import yaml
@@ -427,6 +419,13 @@ class ParameterFiles:
     def __init__(self, manifest: str) -> None:
         self._folder = Path(manifest).parent
         self._files: dict[str, ParameterFile] = {}
+
+    def given(self, node: Node) -> Iterator[tuple[str, ParameterValue, Position]]:
+        """Yield what a node's files set for it: name, value and place, later ones last."""
+        for path in node.parameter_files:
+            for section in self.read(path).sections:
+                if section.matches(node.full_name):
+                    yield from section.parameters
 
     def read(self, path: str) -> ParameterFile:
         """Return what an absolute path holds."""

@@ -20,14 +20,15 @@ import msgspec
 
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
-from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.yaml.document import Document, Place, error
-from lifecycle.manifest.yaml.yaml_parser import (
-    MAX_FINDINGS,
+from lifecycle.manifest.diagnostics import Diagnostic, error
+from lifecycle.manifest.yaml.document import (
     YAML_1_1_BOOLEANS,
+    Document,
+    Place,
     has_leading_zero,
     quote,
 )
+from lifecycle.manifest.yaml.source import MAX_FINDINGS
 
 if TYPE_CHECKING:  # it costs 60 ms, and who only asks for a similar name needs none of it
     from jsonschema import Draft202012Validator

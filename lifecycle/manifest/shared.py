@@ -1,10 +1,10 @@
 """What nodes share: `parameters:`, `remap:`, `restart:` … of documents and groups, by nearness.
 
-Owns: how values that are written for many nodes reach each of them; what is nearer to a node wins:
-the node itself, its parameter files, its group, the groups around it, its document, the documents
-that include that. A shared parameter is for the nodes that have it, as under `/**` in a parameter
-file: an interface without it is not given it, and where a node lacks it nothing is wrong. What is
-done when a process fails (`restart:` …) all nodes of the process share, whichever of them says it.
+Owns: values of parameters, flat; how values that are written for many nodes reach each of them.
+What is nearer to a node wins: the node itself, its parameter files, its group, the groups around
+it, its document, the documents that include that. A shared parameter is for the nodes that have it,
+as under `/**` in a parameter file: an interface without it is not given it. What is done when a
+process fails (`restart:` …) all nodes of the process share, whichever of them says it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.checks.parameters import is_implicit
-from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.interface import Findings, build_parameters
+from lifecycle.manifest.diagnostics import Diagnostic, Findings, Position, error, note, warning
 from lifecycle.manifest.model import (
     SIM_TIME,
     SUPERVISION_KEYS,
@@ -28,7 +27,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.written import read
-from lifecycle.manifest.yaml.document import Document, error, warning
+from lifecycle.manifest.yaml.document import YAML_1_1_BOOLEANS, Document, has_leading_zero, quote
 
 THIS_HOST = "local"
 """Name of the machine of nodes that name none; declared implicitly, without address."""
@@ -190,13 +189,70 @@ def _settled(node: Node, files: ParameterFiles) -> Node:
         kept = {name for name in shared if name in declared or is_implicit(name)}
     else:
         kept = set(shared)
-    for path in node.parameter_files if kept else ():
-        for section in files.read(path).sections:
-            if section.matches(node.full_name):
-                kept -= {name for name, _, _ in section.parameters}
+    if kept:
+        kept -= {name for name, _, _ in files.given(node)}
     gone = shared - kept
     return replace(
         node,
         parameters=tuple(each for each in node.parameters if each[0] not in gone),
         shared=node.shared - {f"parameters.{name}" for name in gone},
     )
+
+
+def build_parameters(node: Document, found: Findings) -> dict[str, tuple[ParameterValue, Position]]:
+    """Flatten `parameters:` of a node, group or document into dotted names, as rcl's files do."""
+    return flat_parameters(node.entries("parameters"), found)
+
+
+def flat_parameters(
+    entries: Iterable[tuple[str, Document]], found: Findings
+) -> dict[str, tuple[ParameterValue, Position]]:
+    """Return values by dotted name, and where each is written."""
+    flat: dict[str, tuple[ParameterValue, Position]] = {}
+    pending = list(reversed(list(entries)))
+    while pending:
+        name, part = pending.pop()
+        if isinstance(part.root.data, dict):
+            inner = [(f"{name}.{key}", each) for key, each in part.entries()]
+            pending.extend(reversed(inner))
+            continue
+        if name in flat:
+            message = f"cannot set the parameter {name!r} twice"
+            first = flat[name][1]
+            hint = f"the first value stands at {first.spelled}"
+            found.append(error("manifest.duplicate-parameter", part.at(), message, hint))
+            continue
+        value = parameter_value(name, part, found)
+        if value is not None:
+            flat[name] = (value, part.key_at())
+    return flat
+
+
+def parameter_value(name: str, part: Document, found: Findings) -> ParameterValue | None:
+    """Return the value of a parameter or argument; None after reporting that it cannot be one."""
+    if isinstance(part.root.data, tuple):
+        return _scalar_tuple(part, found)
+    text = part.root.text
+    if not part.root.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
+        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
+        hint = f'write {name}: true or false, or {name}: "{text}"'
+        found.append(note("manifest.yaml-1.1-boolean", part.at(), message, hint))
+    if not part.root.quoted and has_leading_zero(text):
+        message = f"cannot tell which number {text} is meant as; it is read as a string"
+        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
+        found.append(note("manifest.leading-zero", part.at(), message, hint))
+    return part.scalar
+
+
+def _scalar_tuple(part: Document, found: Findings) -> tuple[bool | int | float | str, ...] | None:
+    """Return a ROS array; None after reporting that its items differ in type."""
+    values = part.plain()
+    types = {type(each).__name__: each for each in values}
+    if len(types) == 1 or not values:
+        return tuple(values)
+    names = {"str": "string", "float": "double"}
+    spelled = " and ".join(f"{names.get(name, name)} {quote(each)}" for name, each in types.items())
+    message = f"cannot mix {spelled} in one array; a ROS array holds one type"
+    hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
+    found.append(error("manifest.parameter-array", part.at(), message, hint))
+    return None

@@ -19,7 +19,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error, warning
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
@@ -43,7 +43,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import name_in_graph
 from lifecycle.manifest.parameter_files import ParameterFiles
-from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of

@@ -21,9 +21,8 @@ from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.checks.parameters import is_implicit
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
-from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
 from lifecycle.plan.python_source import (

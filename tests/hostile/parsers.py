@@ -18,8 +18,8 @@ from lifecycle.graph.status import NodeStatus, NodeStatusError, encode
 from lifecycle.graph.status import decode as decode_status
 from lifecycle.manifest.diagnostics import ManifestError, Position
 from lifecycle.manifest.installed_types import installed_hash
+from lifecycle.manifest.interface import read_interface
 from lifecycle.manifest.loading import load
-from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice

@@ -1,1 +1,50 @@
-"""Static checks of a manifest, one module each; registry.py lists them."""
+"""Static checks of a whole manifest.
+
+Each check is a generator of diagnostics with rule ids `check.*` and reads a system that was read
+and built without an error. Needs no ROS: types are read from the ament index.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+
+from lifecycle.manifest.checks import connections, discovery, flows, names, nodes, parameters
+from lifecycle.manifest.checks.system import DeclaredSystem
+from lifecycle.manifest.diagnostics import Diagnostic, in_order
+from lifecycle.manifest.model import Manifest
+from lifecycle.manifest.parameter_files import ParameterFiles
+
+CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
+    *names.CHECKS,
+    *connections.CHECKS,
+    *nodes.CHECKS,
+    *parameters.CHECKS,
+    *flows.CHECKS,
+    *discovery.CHECKS,
+)
+
+
+def check(
+    manifest: Manifest,
+    *,
+    environment: Mapping[str, str] | None = None,
+    files: ParameterFiles | None = None,
+) -> tuple[Diagnostic, ...]:
+    """Check a manifest that has been built; nothing stops at the first finding.
+
+    Args:
+        manifest: what `load` or a test has built.
+        environment: for AMENT_PREFIX_PATH, ROS_DOMAIN_ID, RMW_IMPLEMENTATION and
+            FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
+        files: parameter files of its nodes that were read already.
+
+    Returns:
+        Every error and warning, in the order of their places in each document.
+    """
+    system = DeclaredSystem.of(
+        manifest,
+        environment=os.environ if environment is None else environment,
+        files=files or ParameterFiles(manifest.path),
+    )
+    return in_order((finding for each in CHECKS for finding in each(system)), [manifest.path])

@@ -1,24 +1,25 @@
-"""Checks of network flow needs: DSCP and 5QI; of links, whose ends must exist and ask. Pure."""
+"""Checks of flow needs, DSCP and 5QI; of links; of rates, delays and silences together. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
-from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.diagnostics import Diagnostic, error, note, warning
 from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
+    QUANTILE,
     EndpointKind,
     FlowNeed,
     Link,
     Node,
+    Quantity,
     RunKind,
     UniqueHow,
 )
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
-from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.dscp import MappedPriority, describe
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -29,8 +30,8 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for transports."""
     mapping = system.manifest.network.transport_priority_mapping
-    at = system.manifest.positions.get("network.transport_priority_mapping")
-    if mapping is not None and at is not None and mapping.low > mapping.high:
+    if mapping is not None and mapping.low > mapping.high:
+        at = system.manifest.where("network.transport_priority_mapping")
         message = f"cannot map priorities to TOS {mapping.low:#x} … {mapping.high:#x}"
         yield error("check.flow-dscp", at, message, "the highest is below the lowest: swap them")
     for node in system.manifest.nodes:
@@ -240,7 +241,69 @@ def _asks(each: Resolved, system: DeclaredSystem) -> bool:
     return resolved is not None and resolved.need.unique is not UniqueRequirement.NOT_REQUIRED
 
 
+_NUMBER = "check.flow-number"
+
+
+def check_numbers(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about the numbers of each endpoint, link and topic."""
+    published: dict[str, list[Quantity]] = {}
+    asked: dict[str, list[Quantity]] = {}
+    for node in system.manifest.nodes:
+        for each in system.needs.of_node(node):
+            yield from _alone(each.need)
+            is_publisher = each.need.kind is EndpointKind.PUBLISHER
+            (published if is_publisher else asked).setdefault(each.topic, []).extend(
+                each.need.quantities
+            )
+    for link in system.manifest.links:
+        yield from _alone(link)
+        asked.setdefault(link.topic, []).extend(link.quantities)
+    for topic, numbers in published.items():
+        if len(system.named(EndpointKind.PUBLISHER, topic)) == 1:  # several may add up
+            yield from _together(numbers, asked.get(topic, ()))
+
+
+def _alone(declared: FlowNeed | Link) -> Iterator[Diagnostic]:
+    if declared.quantile != QUANTILE and declared.max_delay_ms is None:
+        message = f"cannot use quantile {declared.quantile:g} without a delay"
+        yield error(_NUMBER, declared.at, message, "add 'max_delay_ms', or leave it out")
+    for rate in _named("rate_hz", declared.quantities):
+        if not rate.value and rate.most is None:
+            yield error(_NUMBER, rate.at, "cannot use rate_hz without a number", "add min or max")
+        elif rate.most is not None and rate.most < rate.value:
+            yield error(_NUMBER, rate.at, f"cannot keep {rate}: min is larger than max")
+
+
+def _together(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Iterator[Diagnostic]:
+    """Compare what the publishers of a topic declare with what its data are to be."""
+    rates = [each for each in _named("rate_hz", published) if each.most or each.value]
+    if not rates:
+        return
+    fastest, least = max(rates, key=_hertz), max(rates, key=lambda each: each.value)
+    where = f"the publisher declares {fastest} ({fastest.at.spelled})"
+    for rate in _named("rate_hz", asked):
+        if rate.value > _hertz(fastest):
+            yield error(_NUMBER, rate.at, f"cannot ask for {rate}: {where}")
+        elif rate.most is not None and rate.most < least.value * (1 - least.slack):
+            message = f"cannot keep {rate}: the publisher declares {least} ({least.at.spelled})"
+            yield error(_NUMBER, rate.at, message)
+    for silence in _named("max_silence_s", (*published, *asked)):
+        period_s = 1 / _hertz(fastest)
+        if silence.value < period_s:
+            message = f"cannot keep {silence}: {where}, one message in {period_s:.3g} s"
+            yield error(_NUMBER, silence.at, message)
+
+
+def _named(name: str, numbers: Iterable[Quantity]) -> Iterator[Quantity]:
+    return (each for each in numbers if each.name == name)
+
+
+def _hertz(rate: Quantity) -> float:
+    return rate.most or rate.value
+
+
 CHECKS = (
     check_flows,
     check_links,
+    check_numbers,
 )

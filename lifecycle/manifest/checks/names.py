@@ -11,7 +11,7 @@ from lifecycle.manifest.checks.system import (
     read_rule,
     usable_rules,
 )
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, note, warning
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Node
 from lifecycle.manifest.names import (
     RemapKind,
@@ -24,7 +24,6 @@ from lifecycle.manifest.names import (
     parse_rule,
     remap_kind,
 )
-from lifecycle.manifest.yaml.document import error, note, warning
 
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
 
@@ -128,7 +127,7 @@ def _place(node: Node, match: str) -> Position:
 
 def _unused(node: Node, rules: list[tuple[str, RemapRule]]) -> Iterator[Diagnostic]:
     names = _graph_names(node)
-    used = {id(_applied(node, rules, name, kind)) for name, kind in names if name}
+    used = {id(_first(node, rules, name, kind)) for name, kind in names if name}
     for match, rule in rules:
         at = _place(node, match)
         if rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
@@ -145,14 +144,11 @@ def _unused(node: Node, rules: list[tuple[str, RemapRule]]) -> Iterator[Diagnost
             yield from _never_matches(node, match, rule, names)
 
 
-def _applied(
+def _first(
     node: Node, rules: list[tuple[str, RemapRule]], name: str, kind: RemapKind
 ) -> RemapRule | None:
-    """Return the first rule for a fully qualified name, the one that rcl applies."""
-    for _, rule in rules:
-        if rule.applies_to(kind, node.name) and _expanded(node, rule.match) == name:
-            return rule
-    return None
+    fitting = (rule for _, rule in rules if rule.applies_to(kind, node.name))
+    return next((rule for rule in fitting if _expanded(node, rule.match) == name), None)
 
 
 def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:

@@ -1,51 +1,38 @@
-"""Checks of where and in which order nodes start: machines, processes, ports, `after`. Pure."""
+"""Checks of where, in which order and after whom nodes start, and what becomes of them. Pure."""
 
 from __future__ import annotations
 
-import functools
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
+from lifecycle.manifest.checks.parameters import is_implicit, misfit, suggestion
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
 from lifecycle.manifest.model import (
     PROCESS_KEYS,
     SUPERVISION_KEYS,
     After,
     Condition,
     Consequence,
-    DiscoveryMode,
-    DiscoveryRange,
-    EndpointKind,
-    Machine,
+    EndpointPolicy,
     Node,
     Reaction,
+    Readiness,
+    ReadyBy,
     Restart,
     RosArguments,
     Run,
     RunKind,
     TargetState,
 )
-from lifecycle.manifest.names import full_name_problem
-from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network.ports import (
-    LINUX,
-    LOCALHOST_PARTICIPANTS,
-    LOCALHOST_PEERS_RANGE,
-    EphemeralRange,
-    describe_domains,
-    domain_of,
-    max_participants,
-    overflows,
-    safe_domains,
+from lifecycle.manifest.names import (
+    NODE_SERVICES,
+    OUR_SERVICES,
+    full_name_problem,
+    name_problem,
+    topic_of,
 )
-
-_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
-"""Asks for the limits that hold whatever an operating system does with its ports."""
-
-_SUPERVISOR = 1
-"""The observer of the supervisor that each host has."""
 
 
 def check_machines(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -166,16 +153,13 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
     hint = "write 'pause' or 'stop', which are for the whole system"
     for node in system.manifest.nodes:
         for each in node.on_violation:
+            at = node.where(f"on_violation.{each.rule}")
             if each.what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
                 message = f"cannot deactivate {node.key!r} when it violates: {why}"
-                at = node.where(f"on_violation.{each.rule}")
                 yield error("check.on-violation", at, message, hint)
-        for each in node.on_violation:
-            yield from _mode(system, each, node.where(f"on_violation.{each.rule}"))
+            yield from _mode(system, each, at)
     for each in system.manifest.on_violation:
-        top = Position(file=system.manifest.path, line=1, column=1)
-        place = system.manifest.where(f"on_violation.{each.rule}", top)
-        yield from _mode(system, each, place)
+        yield from _mode(system, each, system.manifest.where(f"on_violation.{each.rule}"))
 
 
 def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:
@@ -327,142 +311,6 @@ def _container(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield error("check.container", at, message, "put both on one machine")
 
 
-def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the domain, and about room for all participants.
-
-    The environment is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
-    for ROS_AUTOMATIC_DISCOVERY_RANGE, which holds where it leaves the range to the system.
-    """
-    discovery = system.manifest.discovery
-    domain = discovery.domain_id
-    if domain is None:
-        # One that is no domain is the environment's fault, and refused where it is used.
-        domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
-    start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
-    at = system.manifest.where("discovery", start)
-    try:
-        room = max_participants(domain, LINUX).participants
-    except ValueError as problem:  # of a manifest that was made by code
-        message, _, hint = str(problem).partition("; ")
-        yield error("check.domain", at, message, hint)
-        return
-    if room == 0:
-        domains = describe_domains(safe_domains(LINUX))
-        message = (
-            f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
-            f"by default"
-        )
-        yield note("check.domain", at, message, f"use domain {domains}")
-    for host in system.hosts.values():
-        yield from _crowded(system, host, domain, system.manifest.where("discovery", host[0].at))
-        yield from _beyond_localhost(system, host)
-
-
-def _crowded(
-    system: DeclaredSystem, host: list[Machine], domain: int, at: Position
-) -> Iterator[Diagnostic]:
-    nodes = _nodes_on(system, host)
-    over = functools.partial(
-        overflows,
-        domain,
-        participants=_SUPERVISOR + _participants(nodes, system),
-        unique_subscriptions=sum(
-            each.unique and each.need.kind is EndpointKind.SUBSCRIPTION
-            for node in nodes
-            for each in system.needs.of_node(node)
-        ),
-        host=_spell_host(nodes),
-    )
-    refused = over(ephemeral=_NO_EPHEMERAL)
-    for each in refused:
-        message, _, hint = each.partition("; ")
-        yield error("check.ports", at, message, hint)
-    # Where no participant at all is safe, check.domain has reported it.
-    if not refused and max_participants(domain, LINUX).participants:
-        for each in over(ephemeral=LINUX):
-            message, _, hint = each.partition("; ")
-            yield note("check.ports", at, message, hint)
-
-
-def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:
-    names = {machine.name for machine in host}
-    return [node for node in system.manifest.nodes if node.machine in names]
-
-
-def _spell_host(nodes: list[Node]) -> str:
-    used = dict.fromkeys(node.machine for node in nodes)
-    return f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}"
-
-
-_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-_OTHERWISE_FOUND = frozenset(
-    {
-        _RANGE,
-        "FASTDDS_DEFAULT_PROFILES_FILE",
-        "FASTRTPS_DEFAULT_PROFILES_FILE",
-        "ROS_DISCOVERY_SERVER",
-        "ROS_DOMAIN_ID",
-    }
-)
-"""Variables of a process by which it may find others in another way than its system."""
-
-
-def _beyond_localhost(system: DeclaredSystem, host: list[Machine]) -> Iterator[Diagnostic]:
-    """Yield a finding where participants of a host could not all find each other on localhost.
-
-    Counted is what certainly looks for others in the way of rmw_fastrtps: the supervisor's
-    participant, and those of processes that it starts.
-    """
-    discovery = system.manifest.discovery
-    if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
-        return
-    said = "'range: localhost'"
-    if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
-        said = f"{_RANGE}={system.environment.get(_RANGE, '')}"
-        if system.environment.get(_RANGE, "") != DiscoveryRange.LOCALHOST.name:
-            return
-    elif discovery.range is not DiscoveryRange.LOCALHOST:
-        return
-    profiles = _OTHERWISE_FOUND - {_RANGE, "ROS_DOMAIN_ID"}
-    nodes = [
-        node
-        for node in _nodes_on(system, host)
-        if node.run.kind is not RunKind.ATTACH
-        and system.rmw_of(node).startswith("rmw_fastrtps")
-        and not _OTHERWISE_FOUND & {name for name, _ in node.run.environment}
-        and not any(system.environment.get(name) for name in profiles)
-    ]
-    participants = _SUPERVISOR + _participants(nodes, system)
-    if participants <= LOCALHOST_PARTICIPANTS:
-        return
-    message = (
-        f"cannot run {participants} participants with {said} on {_spell_host(nodes)}: at most "
-        f"{LOCALHOST_PARTICIPANTS} all find each other, because each looks for participants 0 to "
-        f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
-    )
-    hint = "use 'range: subnet', or give several nodes one 'process:'"
-    yield error("check.localhost", system.manifest.where("discovery", nodes[0].at), message, hint)
-
-
-def _participants(nodes: list[Node], system: DeclaredSystem) -> int:
-    """Count DDS participants as the planner makes them.
-
-    One for each process and each choice of transports in it, and one more for each group of
-    publishers that need their own.
-    """
-    needs = system.needs
-    shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
-    extra = 0
-    for node in nodes:
-        if node.run.kind is RunKind.PYTHON:
-            on_connections = {entry for each in node.connections for entry in each.map}
-            extra += sum(
-                any((group.kind, name) not in on_connections for name in group.names)
-                for group in needs.groups(node)
-            )
-    return len(shared) + extra
-
-
 def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the start order of nodes."""
     for node in system.manifest.nodes:
@@ -554,6 +402,74 @@ def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 path[after.node] = iter(edges[after.node])
 
 
+def check_readiness(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about topics, services and parameters that others are waited for to have."""
+    for node in system.manifest.nodes:
+        for after in node.after:
+            other, wanted = system.nodes.get(after.node), after.condition
+            if other in (None, node) or not isinstance(wanted, Readiness):
+                continue
+            if wanted.by is ReadyBy.PARAMETER:
+                yield from _ready_parameter(after, wanted, other, system)
+            elif problem := name_problem(wanted.name):
+                message = f"cannot wait until {after.node!r} {wanted}: {problem}"
+                yield error("check.name", after.at, message)
+            else:
+                yield from _ready_endpoint(after, wanted, other, system)
+
+
+def _ready_endpoint(
+    after: After, wanted: Readiness, other: Node, system: DeclaredSystem
+) -> Iterator[Diagnostic]:
+    noun, message = wanted.by.kinds[0].noun, f"cannot wait until {after.node!r} {wanted}"
+    names = [(kind, topic_of(other, wanted.name, kind)) for kind in wanted.by.kinds]
+    if any(each.node.key == other.key for one in names for each in system.named(*one)):
+        return
+    if not _of_every_node(other).isdisjoint(name for _, name in names):
+        hint = f"write '{after.node}: started'"
+        yield error("check.after-undeclared", after.at, f"{message}: every node has it", hint)
+        return
+    declared = [each.name for each in other.interface.endpoints if each.kind in wanted.by.kinds]
+    why = f"{message}: its interface declares no such {noun}"
+    hint = did_you_mean(wanted.name, declared)
+    if other.endpoints is EndpointPolicy.DECLARED:
+        hint = hint or f"declare it in the interface of {after.node!r}, or write 'endpoints: open'"
+        yield error("check.after-undeclared", after.at, why, hint)
+    elif declared:
+        yield note("check.after-undeclared", after.at, f"{why}, and may have others", hint)
+
+
+def _of_every_node(node: Node) -> frozenset[str]:
+    """Return what a node has as soon as it is there, which is not looked at in the graph."""
+    own = (*NODE_SERVICES, *OUR_SERVICES, "transition_event")
+    return frozenset({"/rosout", "/parameter_events", *(f"{node.full_name}/{x}" for x in own)})
+
+
+def _ready_parameter(
+    after: After, wanted: Readiness, other: Node, system: DeclaredSystem
+) -> Iterator[Diagnostic]:
+    name, value = wanted.name, wanted.value
+    message = f"cannot wait until {after.node!r} {wanted}"
+    given, at = dict(other.parameters), other.where(f"parameters.{name}")
+    declared = {each.name: each for each in other.interface.parameters}
+    if (declaration := declared.get(name)) is None:
+        if other.interface.has_all_parameters and not is_implicit(name):
+            why = f"{message}: its interface declares no such parameter"
+            hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
+            yield error("check.after-undeclared", after.at, why, hint)
+    elif value is not None and misfit(value, declaration.type):
+        why = f"{message}: it is declared as {declaration.type}"
+        yield error("check.after-value", after.at, why, suggestion(value, declaration.type))
+        return
+    elif name not in given and declaration.default is not None:
+        given, at = {name: declaration.default}, declaration.at
+    modes = (each for mode in system.manifest.modes for each in mode.parameters)
+    is_fixed = all((each.node, each.name) != (other.key, name) for each in modes)
+    if given.get(name, value) != value and is_fixed:
+        why = f"{message}: it must keep the value that it is given at {at.spelled}"
+        yield error("check.after-value", after.at, why, "leave that value out")
+
+
 CHECKS = (
     check_order,
     check_machines,
@@ -563,5 +479,5 @@ CHECKS = (
     check_health,
     check_on_violation,
     check_modes,
-    check_ports,
+    check_readiness,
 )

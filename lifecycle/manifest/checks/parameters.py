@@ -14,16 +14,15 @@ from typing import NamedTuple
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.interface import nearest_file
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
-from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.parameter_files import (
     ParameterFile,
     read_scalar,
     type_of,
 )
-from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.manifest.yaml.yaml_parser import quote
+from lifecycle.manifest.yaml.document import quote
 
 _IMPLICIT = ("use_sim_time", "start_type_description_service")
 
@@ -133,13 +132,7 @@ def _empty_arrays(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
         for each in command_line_parameters(node)
         if each.name and each.node in ("", node.name)
     ]
-    given += [
-        each
-        for path in node.parameter_files
-        for section in system.files.read(path).sections
-        if section.matches(node.full_name)
-        for each in section.parameters
-    ]
+    given += system.files.given(node)
     for name, value, at in given:
         if value == ():
             message = f"cannot tell the type of {name!r} of {node.key!r}: [] has none in ROS"
@@ -197,13 +190,7 @@ def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
         return True
     if any(each.name == name and each.default is not None for each in node.interface.parameters):
         return True
-    return any(
-        name == found
-        for path in node.parameter_files
-        for section in system.files.read(path).sections
-        if section.matches(node.full_name)
-        for found, _, _ in section.parameters
-    )
+    return any(name == found for found, _, _ in system.files.given(node))
 
 
 def _no_effect(node: Node) -> Iterator[Diagnostic]:

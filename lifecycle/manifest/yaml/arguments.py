@@ -15,8 +15,17 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, warning
+from lifecycle.manifest.diagnostics import Diagnostic, error, warning
+from lifecycle.manifest.yaml.document import (
+    Document,
+    Place,
+    Scalar,
+    Value,
+    check_finite,
+    quote,
+    resolve,
+)
+from lifecycle.manifest.yaml.source import MAX_FINDINGS
 from lifecycle.manifest.yaml.substitutions import (
     NOWHERE,
     NotRunError,
@@ -27,7 +36,6 @@ from lifecycle.manifest.yaml.substitutions import (
     parse_text,
     truth,
 )
-from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, check_finite, quote, resolve
 
 MAX_TEXT = 1 << 20
 """Characters that the substitutions of one document may produce."""

@@ -1,21 +1,25 @@
-"""YAML values with their source positions (file, line, column), paths into them, typed access.
+"""YAML values with their source positions, paths into them, typed access; what scalars mean.
 
-Owns: `Value`, `Document` and the spelling of document paths. What reads a value as a scalar, a
-sequence or a mapping relies on the schema (on a document that was not validated it may fail an
-assertion). Knows nothing of YAML's syntax nor of what a manifest means, so that NoDL documents use
-it as well. Pure.
+Owns: `Value`, `Document`, the spelling of document paths, and the one place where text becomes
+bool, int, float, null or string. What reads a value as a scalar, a sequence or a mapping relies on
+the schema. Knows nothing of what a manifest means. Pure.
+
+Unquoted scalars follow YAML 1.2.2 §10.3.2, the core schema. So `yes`, `on`, `off` and `1:30` are
+strings here, and `0o17` is octal. In one thing the rules are narrower, as JSON is: an integer does
+not begin with 0, which versions of YAML read differently.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Position
 
 Scalar = bool | int | float | str | None
 """A scalar of YAML 1.2's core schema."""
@@ -167,16 +171,108 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
         return default if value is None else value.text
 
 
-def error(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
-    """Make an error; `message` starts with "cannot"."""
-    return Diagnostic(rule=rule, severity=Severity.ERROR, at=at, message=message, hint=hint)
+INT64_MIN = -(2**63)
+INT64_MAX = 2**63 - 1
+"""ROS integers are int64 (rcl_interfaces/ParameterValue)."""
+
+YAML_1_1_BOOLEANS = frozenset(
+    spelled
+    for word in ("y", "yes", "on", "n", "no", "off")
+    for spelled in (word, word.capitalize(), word.upper())
+)
+"""Booleans of YAML 1.1 (and of rcl's parameter files) that YAML 1.2 reads as strings."""
+
+_NULL = frozenset({"", "~", "null", "Null", "NULL"})
+_TRUE = frozenset({"true", "True", "TRUE"})
+_FALSE = frozenset({"false", "False", "FALSE"})
+_DECIMAL = re.compile(r"[-+]?(0|[1-9][0-9]*)\Z")
+_LEADING_ZERO = re.compile(r"[-+]?0[0-9]+\Z")
+_OCTAL = re.compile(r"0o[0-7]+\Z")
+_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
+_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)\Z")
+_NOT_A_NUMBER = frozenset({".nan", ".NaN", ".NAN"})
+_LONGEST_INT = 80  # digits; int() is quadratic in them and refuses 4300, INT64_MIN has 19
 
 
-def warning(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
-    """Make a warning: something that is declared is in doubt; `message` starts with "cannot"."""
-    return Diagnostic(rule=rule, severity=Severity.WARNING, at=at, message=message, hint=hint)
+def resolve(text: str) -> Scalar:
+    """Return what the unquoted scalar `text` means.
+
+    `.inf` and `.nan` are doubles; where they may be written is `may_be_any_double`'s.
+
+    Raises:
+        ValueError: a number that is too large for a double or does not fit into 64 bits; the
+            message is a phrase that follows "cannot use '…': ".
+    """
+    if text in _NULL:
+        return None
+    if text in _TRUE:
+        return True
+    if text in _FALSE:
+        return False
+    for pattern, base in ((_DECIMAL, 10), (_OCTAL, 8), (_HEXADECIMAL, 16)):
+        if pattern.match(text):
+            return _integer(text, base)
+    if _FLOAT.match(text) and not has_leading_zero(text):
+        number = float(text)
+        if math.isfinite(number):
+            return number
+        raise ValueError(_FINITE)
+    special = not_finite(text)
+    return text if special is None else special
 
 
-def note(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
-    """Make a note: advice, with nothing in doubt that is declared; `message` as of a warning."""
-    return Diagnostic(rule=rule, severity=Severity.NOTE, at=at, message=message, hint=hint)
+_FINITE = "a number must be finite"
+
+
+def not_finite(text: str) -> float | None:
+    """Return the double that YAML's `.inf`, `-.INF`, `.NaN` … spell; None of anything else."""
+    if text in _NOT_A_NUMBER:
+        return math.nan
+    return float(text.replace(".", "")) if _INFINITE.match(text) else None
+
+
+_NAMED = frozenset({"nodes", "groups", "modes", "machines", "arguments"})
+"""Sections whose keys users choose: one that is called `parameters` is none."""
+
+
+def may_be_any_double(place: Place) -> bool:
+    """Whether a number there may be infinite or none: values of parameters, and only those."""
+    return any(
+        each == "extra_arguments"
+        or (each == "parameters" and (index == 0 or place[index - 1] not in _NAMED))
+        for index, each in enumerate(place)
+    )
+
+
+def check_finite(number: object, place: Place) -> None:
+    """Raise the ValueError of `resolve` for a number that must be finite at this place."""
+    if isinstance(number, float) and not math.isfinite(number) and not may_be_any_double(place):
+        raise ValueError(_FINITE)
+
+
+def has_leading_zero(text: str) -> bool:
+    """Whether this is digits that versions of YAML read as different values."""
+    return _LEADING_ZERO.match(text) is not None
+
+
+def _integer(text: str, base: int) -> int:
+    if len(text) <= _LONGEST_INT:
+        number = int(text, base)
+        if INT64_MIN <= number <= INT64_MAX:
+            return number
+    raise ValueError("an integer must fit into 64 bits, -2**63 to 2**63-1")
+
+
+def quote(value: object, *, limit: int = 60) -> str:
+    """Spell a value for a message: as YAML would show it, cut to `limit` characters."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, (list, tuple)):
+        return "a list"
+    spelled = repr(value)
+    return spelled if len(spelled) <= limit else f"{spelled[: limit - 2]}…{spelled[-1]}"

@@ -27,8 +27,8 @@ import msgspec
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
+from lifecycle.manifest.yaml.document import quote
 from lifecycle.manifest.yaml.source import MAX_BYTES, decode, read_bytes
-from lifecycle.manifest.yaml.yaml_parser import quote
 
 MAX_DEPTH = 8
 """Substitutions inside each other."""

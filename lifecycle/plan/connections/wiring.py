@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error
 from lifecycle.manifest.model import (
     DataLayerSource,
     Discovery,
@@ -28,7 +28,6 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.qos import Durability, Reliability
-from lifecycle.manifest.yaml.document import error
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import TRANSPORTS_VARIABLE, medium_of, udp_to
 from lifecycle.network.nfe import UniqueRequirement

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.diagnostics import Position, Severity
+from lifecycle.manifest.interface import MAX_DOCUMENTS, read_interface
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
-from lifecycle.manifest.nodl import MAX_DOCUMENTS, read_interface
 from lifecycle.manifest.qos import (
     POLICIES,
     PRESETS,

@@ -8,12 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.yaml.yaml_parser import (
-    INT64_MAX,
-    INT64_MIN,
-    may_be_any_double,
-    resolve,
-)
+from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, may_be_any_double, resolve
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.checks.registry import check
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import (
     After,
     Condition,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.checks.registry import check
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowNeed,

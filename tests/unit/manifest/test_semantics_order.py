@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.checks.registry import check
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import Condition, Manifest
 from tests.builders import manifest, node
 

@@ -1,17 +1,18 @@
-"""Checks of discovery and transport: range, RMW, discovery server, media of flows, datagram sizes.
+"""Checks of discovery, RMW, domain and participants; of transports and datagrams of flows.
 
-What happens at run time decides; check.rmw only fails earlier.
-Whether two nodes have a transport in common is the planner's to say (plan.unconnectable). Pure.
+What happens at run time decides; these only fail earlier. Whether two nodes have a transport in
+common is the planner's to say (plan.unconnectable). Pure.
 """
 
 from __future__ import annotations
 
+import functools
 import ipaddress
 from collections.abc import Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
 from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
     Authority,
@@ -21,10 +22,10 @@ from lifecycle.manifest.model import (
     DiscoveryRange,
     EndpointKind,
     FlowTransport,
+    Machine,
     Node,
     RunKind,
 )
-from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.medium import (
     DEFAULT_RMW,
     DEFAULT_TCP,
@@ -35,6 +36,17 @@ from lifecycle.network.medium import (
     max_unfragmented,
 )
 from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.ports import (
+    LINUX,
+    LOCALHOST_PARTICIPANTS,
+    LOCALHOST_PEERS_RANGE,
+    EphemeralRange,
+    describe_domains,
+    domain_of,
+    max_participants,
+    overflows,
+    safe_domains,
+)
 
 _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 """RMWs that are known to give no endpoint a network flow or a DSCP of its own."""
@@ -42,16 +54,13 @@ _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 
 def check_discovery(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about discovery and the data layer's authority."""
-    discovery = system.manifest.discovery
-    section = system.manifest.positions.get("discovery")
-    if section is not None:
-        yield from _range(system, section)
-        yield from _addresses(system, section)
-        yield from _transport(system, section)
-        yield from _server(system, section)
-        yield from _rmws(system, section)
-        for node in system.manifest.nodes:
-            yield from _foreign_rmws(discovery, node)
+    yield from _range(system)
+    yield from _addresses(system)
+    yield from _transport(system)
+    yield from _server(system)
+    yield from _rmws(system)
+    for node in system.manifest.nodes:
+        yield from _foreign_rmws(system.manifest.discovery, node)
     yield from _authority(system)
 
 
@@ -59,9 +68,9 @@ def _mode(discovery: Discovery) -> str:
     return f"discovery mode {discovery.mode.value}"
 
 
-def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _range(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
-    at = system.manifest.where("discovery.range", section)
+    at = system.manifest.where("discovery.range")
     if (
         discovery.mode is not DiscoveryMode.DYNAMIC
         and discovery.range is not DiscoveryRange.SYSTEM_DEFAULT
@@ -73,10 +82,10 @@ def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-range", at, message, "remove 'range'")
 
 
-def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _addresses(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Judge addresses that others must know beforehand."""
     discovery, found = system.manifest.discovery, system.hosts
-    at = system.manifest.where("discovery.mode", section)
+    at = system.manifest.where("discovery.mode")
     if discovery.mode is DiscoveryMode.DYNAMIC or len(found) < 2:
         return
     for machine in found.get("", ()):
@@ -104,9 +113,9 @@ def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
         yield error("check.discovery-address", at, message, hint)
 
 
-def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _transport(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
-    at = system.manifest.where("discovery.transport", section)
+    at = system.manifest.where("discovery.transport")
     transport, found = discovery.transport, system.hosts
     medium = transport.medium
     rule, what = "check.discovery-transport", f"cannot let discovery use {transport.value} alone"
@@ -137,10 +146,10 @@ def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
             yield error(rule, machines[0].at, message, hint)
 
 
-def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _server(system: DeclaredSystem) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     name = discovery.server_machine
-    at = system.manifest.where("discovery.server_machine", section)
+    at = system.manifest.where("discovery.server_machine")
     if not name:
         return
     if discovery.mode is not DiscoveryMode.SERVER:
@@ -160,11 +169,11 @@ def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-server", at, message, "choose a machine that runs a node")
 
 
-def _rmws(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
+def _rmws(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Only Fast DDS can be configured so; a server serves only its own kind."""
     discovery = system.manifest.discovery
     dynamic = discovery.mode is DiscoveryMode.DYNAMIC
-    at = system.manifest.where(f"discovery.{'transport' if dynamic else 'mode'}", section)
+    at = system.manifest.where(f"discovery.{'transport' if dynamic else 'mode'}")
     if dynamic and discovery.transport is FlowTransport.ANY:
         return
     by_rmw: dict[str, list[str]] = {}
@@ -214,16 +223,13 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
 
 def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
     layer = system.manifest.data_layer
-    section = system.manifest.positions.get("data_layer")
-    if section is None:
-        return
     if layer.authority is Authority.NODES and layer.source is DataLayerSource.DYNAMIC:
         message = (
             "cannot make the data layer graph from node configurations under authority 'nodes': "
             "each node only follows what it was started with, and nobody would negotiate"
         )
         hint = "use 'authority: supervisor', or 'source: static'"
-        at = system.manifest.where("data_layer.source", section)
+        at = system.manifest.where("data_layer.source")
         yield error("check.authority", at, message, hint)
     if layer.authority is not Authority.SUPERVISOR:
         return
@@ -388,4 +394,157 @@ def _has_ipv6(environment: Mapping[str, str]) -> bool:
     )
 
 
-CHECKS = (check_discovery, check_transport, check_middleware)
+_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
+"""Asks for the limits that hold whatever an operating system does with its ports."""
+
+
+_SUPERVISOR = 1
+"""The observer of the supervisor that each host has."""
+
+
+def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about the domain, and about room for all participants.
+
+    The environment is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
+    for ROS_AUTOMATIC_DISCOVERY_RANGE, which holds where it leaves the range to the system.
+    """
+    discovery = system.manifest.discovery
+    domain = discovery.domain_id
+    if domain is None:
+        # One that is no domain is the environment's fault, and refused where it is used.
+        domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
+    start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
+    section = system.manifest.positions.get("discovery")
+    at = section or start
+    try:
+        room = max_participants(domain, LINUX).participants
+    except ValueError as problem:  # of a manifest that was made by code
+        message, _, hint = str(problem).partition("; ")
+        yield error("check.domain", at, message, hint)
+        return
+    if room == 0:
+        domains = describe_domains(safe_domains(LINUX))
+        message = (
+            f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
+            f"by default"
+        )
+        yield note("check.domain", at, message, f"use domain {domains}")
+    for host in system.hosts.values():
+        yield from _crowded(system, host, domain, section or host[0].at)
+        yield from _beyond_localhost(system, host)
+
+
+def _crowded(
+    system: DeclaredSystem, host: list[Machine], domain: int, at: Position
+) -> Iterator[Diagnostic]:
+    nodes = _nodes_on(system, host)
+    over = functools.partial(
+        overflows,
+        domain,
+        participants=_SUPERVISOR + _participants(nodes, system),
+        unique_subscriptions=sum(
+            each.unique and each.need.kind is EndpointKind.SUBSCRIPTION
+            for node in nodes
+            for each in system.needs.of_node(node)
+        ),
+        host=_spell_host(nodes),
+    )
+    refused = over(ephemeral=_NO_EPHEMERAL)
+    for each in refused:
+        message, _, hint = each.partition("; ")
+        yield error("check.ports", at, message, hint)
+    # Where no participant at all is safe, check.domain has reported it.
+    if not refused and max_participants(domain, LINUX).participants:
+        for each in over(ephemeral=LINUX):
+            message, _, hint = each.partition("; ")
+            yield note("check.ports", at, message, hint)
+
+
+def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:
+    names = {machine.name for machine in host}
+    return [node for node in system.manifest.nodes if node.machine in names]
+
+
+def _spell_host(nodes: list[Node]) -> str:
+    used = dict.fromkeys(node.machine for node in nodes)
+    return f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}"
+
+
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+
+
+_OTHERWISE_FOUND = frozenset(
+    {
+        _RANGE,
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "ROS_DISCOVERY_SERVER",
+        "ROS_DOMAIN_ID",
+    }
+)
+"""Variables of a process by which it may find others in another way than its system."""
+
+
+def _beyond_localhost(system: DeclaredSystem, host: list[Machine]) -> Iterator[Diagnostic]:
+    """Yield a finding where participants of a host could not all find each other on localhost.
+
+    Counted is what certainly looks for others in the way of rmw_fastrtps: the supervisor's
+    participant, and those of processes that it starts.
+    """
+    discovery = system.manifest.discovery
+    if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
+        return
+    said = "'range: localhost'"
+    if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
+        said = f"{_RANGE}={system.environment.get(_RANGE, '')}"
+        if system.environment.get(_RANGE, "") != DiscoveryRange.LOCALHOST.name:
+            return
+    elif discovery.range is not DiscoveryRange.LOCALHOST:
+        return
+    profiles = _OTHERWISE_FOUND - {_RANGE, "ROS_DOMAIN_ID"}
+    nodes = [
+        node
+        for node in _nodes_on(system, host)
+        if node.run.kind is not RunKind.ATTACH
+        and system.rmw_of(node).startswith("rmw_fastrtps")
+        and not _OTHERWISE_FOUND & {name for name, _ in node.run.environment}
+        and not any(system.environment.get(name) for name in profiles)
+    ]
+    participants = _SUPERVISOR + _participants(nodes, system)
+    if participants <= LOCALHOST_PARTICIPANTS:
+        return
+    message = (
+        f"cannot run {participants} participants with {said} on {_spell_host(nodes)}: at most "
+        f"{LOCALHOST_PARTICIPANTS} all find each other, because each looks for participants 0 to "
+        f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
+    )
+    hint = "use 'range: subnet', or give several nodes one 'process:'"
+    at = system.manifest.positions.get("discovery", nodes[0].at)
+    yield error("check.localhost", at, message, hint)
+
+
+def _participants(nodes: list[Node], system: DeclaredSystem) -> int:
+    """Count DDS participants as the planner makes them.
+
+    One for each process and each choice of transports in it, and one more for each group of
+    publishers that need their own.
+    """
+    needs = system.needs
+    shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
+    extra = 0
+    for node in nodes:
+        if node.run.kind is RunKind.PYTHON:
+            on_connections = {entry for each in node.connections for entry in each.map}
+            extra += sum(
+                any((group.kind, name) not in on_connections for name in group.names)
+                for group in needs.groups(node)
+            )
+    return len(shared) + extra
+
+
+CHECKS = (
+    check_discovery,
+    check_transport,
+    check_middleware,
+    check_ports,
+)
