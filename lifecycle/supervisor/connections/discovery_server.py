@@ -97,7 +97,7 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
 async def end(system: System, hurry: asyncio.Event) -> None:
     """End it, if it is ours; nothing of the system may need it any more. Again is harmless."""
     server = system.server
-    if server is None or server.child is None:
+    if server is None or not server.pid:
         return
     if not server.ended.done():
         _say(system, ProcessState.STOPPING)

@@ -151,7 +151,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         return ExitCode.OK
     from lifecycle.middleware.process.shared_memory import sweep
     from lifecycle.supervisor.connections.networks import remove_programmed
-    from lifecycle.supervisor.processes.orphans import end_run
+    from lifecycle.supervisor.processes.fork_server import end_run
 
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:

@@ -53,15 +53,14 @@ from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
+from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     begin_logs,
     check_log_root,
     forget_runs,
     log_directory,
 )
-from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,

@@ -42,7 +42,7 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.health.peers import FAILED, Peers
 from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.processes.orphans import reap_adopted
+from lifecycle.supervisor.processes.fork_server import reap_adopted
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,

@@ -608,7 +608,7 @@ class SessionWorld(World):
         assert self.story[-1] == f"[stopped] {exit_code}"
         assert self.result.verdict.run.exit_code == exit_code
         assert self.story.count("networks restored") == 1
-        assert all(each.exited.done() for each in self.hosts.processes.values())
+        assert all(each.has_ended for each in self.hosts.processes.values())
         assert self._stopping_at_s is not None
         assert self.emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()
