@@ -42,6 +42,7 @@ from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (
+    FORK_SERVER,
     RunDirectory,
     RunRecord,
     boot_id,
@@ -82,7 +83,6 @@ from lifecycle.supervisor.run.options import (
     observer_connections,
     own_machines,
 )
-from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
@@ -133,8 +133,8 @@ def up(
             where Fast DDS hangs in that, this process ends with that exit code after `LEAVE_S`.
 
     Raises:
-        AlreadyRunningError: another supervisor has this system in this domain.
-        UsageError: the plan has nothing for this host, the run directory or the options of a
+        UsageError: another supervisor has this system in this domain, the plan has nothing for
+            this host, the run directory or the options of a
             network to program cannot be used.
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
@@ -151,6 +151,7 @@ def up(
         run_name(plan, options.machine),
         process.run_id,
         domain_id=plan.domain_id,
+        processes={process.popen.pid: FORK_SERVER},
     )
     journal = Journal(
         plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
@@ -179,8 +180,6 @@ def up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
-            records = Records(directory, system, fork_server)
-            records.write()
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
@@ -192,7 +191,6 @@ def up(
                     system,
                     Means(
                         directory=directory,
-                        records=records,
                         fork_server=fork_server,
                         participant=observer_participant,
                         networks=networks,

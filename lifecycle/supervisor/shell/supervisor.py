@@ -53,7 +53,6 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended, result_of
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
@@ -79,7 +78,6 @@ class Means(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         directory: acquired for this run.
-        records: of this run.
         fork_server: starts processes.
         participant: sees the graph and reaches foreign nodes; made before any process.
         networks: programmed while the system is active.
@@ -87,7 +85,6 @@ class Means(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     directory: RunDirectory
-    records: Records
     fork_server: ForkServer
     participant: ObserverParticipant
     networks: Networks

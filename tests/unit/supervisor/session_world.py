@@ -61,7 +61,6 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
@@ -505,7 +504,6 @@ class SessionWorld(World):
         with self.ending, self._run_directory() as directory, kept:
             means = Means(
                 directory=directory,
-                records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
                 networks=FakeNetworks(self.hosts),
