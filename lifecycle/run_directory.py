@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -92,10 +93,6 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
 def new_run_id() -> str:
     """Return a fresh value for RUN_VARIABLE."""
     return os.urandom(16).hex()
-
-
-class AlreadyRunningError(UsageError):
-    """Another supervisor has this system."""
 
 
 def runtime_root(environment: Mapping[str, str]) -> Path:
@@ -236,28 +233,36 @@ class RunDirectory:
         self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
+        self._children: dict[int, ChildRecord] = {}
 
     @classmethod
     def acquire(
-        cls, root: Path, name: str, run_id: str, *, domain_id: int | None = None
+        cls,
+        root: Path,
+        name: str,
+        run_id: str,
+        *,
+        domain_id: int | None = None,
+        processes: Mapping[int, str] = MappingProxyType({}),
     ) -> RunDirectory:
         """Take the directory for the run `run_id`, in the domain `domain_id`.
 
+        `processes` are those of it that run already, names by pid.
+
         Raises:
-            AlreadyRunningError: another supervisor has it.
-            UsageError: the directory belongs to another user, is writable by others, or cannot be
-                made or written.
+            UsageError: another supervisor has it, or the directory belongs to another user, is
+                writable by others, or cannot be made or written.
         """
         directory = cls(root / name, run_id, domain_id)
         try:
             directory._take()
             directory.previous = read_record(directory.path)
             directory.socket_path.unlink(missing_ok=True)
-            directory.record(())
+            directory.record(processes)
         except BlockingIOError:
             record = read_record(directory.path)
             pid = f" (pid {record.supervisor.pid})" if record else ""
-            raise AlreadyRunningError(
+            raise UsageError(
                 f"cannot bring up {name!r}: another supervisor{pid} runs it already",
                 hint=f"end it first: lifecycle down {name}",
             ) from None
@@ -312,10 +317,20 @@ class RunDirectory:
         """Where `lifecycle down` and `status` reach the supervisor."""
         return self.path / "control"
 
-    def record(self, children: tuple[ChildRecord, ...]) -> None:
-        """Write down what runs, in one piece."""
+    def record(self, processes: Mapping[int, str]) -> None:
+        """Write down what runs, names by pid, in one piece.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         from lifecycle import codec
 
+        known, self._children = self._children, {}
+        for pid, name in processes.items():
+            if pid in known:
+                self._children[pid] = known[pid]
+            elif (ticks := start_ticks(pid)) is not None:
+                self._children[pid] = ChildRecord(name=name, pid=pid, start_ticks=ticks)
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
@@ -323,7 +338,7 @@ class RunDirectory:
             supervisor=ChildRecord(
                 name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
             ),
-            children=children,
+            children=tuple(self._children.values()),
             domain_id=self.domain_id,
             participant=self.participant,
         )

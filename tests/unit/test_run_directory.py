@@ -20,7 +20,6 @@ from lifecycle.cli import main
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.run_directory import (
     LEDGER_NAME,
-    AlreadyRunningError,
     ChildRecord,
     RunDirectory,
     find_run,
@@ -30,15 +29,16 @@ from lifecycle.run_directory import (
     running,
     runtime_root,
     short_path,
+    start_ticks,
 )
 from lifecycle.supervisor.control import protocol
-from lifecycle.supervisor.control.client import status
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ControlRequest,
     Question,
     SystemStatus,
     ask,
+    status,
 )
 from lifecycle.supervisor.control.server import ControlServer, follow
 from tests.builders import plan_of, planned_node
@@ -60,7 +60,7 @@ def test_a_second_supervisor_of_one_system_is_refused_with_the_pid_of_the_first(
     first = RunDirectory.acquire(tmp_path, "robot@30", "abc")
     record = read_record(first.path)
     assert record is not None
-    with pytest.raises(AlreadyRunningError) as caught:
+    with pytest.raises(UsageError) as caught:
         RunDirectory.acquire(tmp_path, "robot@30", "def")
     assert str(caught.value) == (
         f"cannot bring up 'robot@30': another supervisor (pid {record.supervisor.pid}) runs it "
@@ -98,8 +98,7 @@ def test_a_supervisor_that_is_starting_is_not_said_to_have_died(tmp_path: Path) 
 
 def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> None:
     killed = RunDirectory.acquire(tmp_path, "robot@30", "abc", domain_id=30)
-    child = ChildRecord(name="camera", pid=17, start_ticks=4)
-    killed.record((child,))
+    killed.record({os.getpid(): "camera"})
     record = (killed.path / "record.json").read_bytes()
     killed.release()
     killed.path.mkdir(mode=0o700)
@@ -107,6 +106,8 @@ def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> 
     following = RunDirectory.acquire(tmp_path, "robot@30", "def")
     assert following.previous is not None
     assert following.previous.run_id == "abc"
+    ticks = start_ticks(os.getpid())
+    child = ChildRecord(name="camera", pid=os.getpid(), start_ticks=ticks or 0)
     assert following.previous.children == (child,)
     assert following.previous.domain_id == 30
     following.release()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from lifecycle.cli.up_output import RunOutput
     from lifecycle.programming.target import Chosen
-    from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+    from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult
 
 
@@ -171,7 +171,7 @@ def command(
 
 
 def _fork_server(program: tuple[Chosen, ...]) -> ForkServerProcess:
-    from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+    from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
 
     tokens: frozenset[str] = frozenset()
     if program:  # their secrets, which nothing that is started shall have

@@ -13,7 +13,7 @@ often.
 Beside which nodes are silent, a notice says when its sender received the last one of each other
 supervisor. So two of them exchange the four timestamps by which their clocks are compared
 (lifecycle.measure.clock): Fast DDS takes them where it sends and receives. It says on which ports
-its sender receives marked datagrams, too (lifecycle.supervisor.health.marks).
+its sender receives marked datagrams, too (lifecycle.supervisor.nodes.marks).
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import signal
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.graph.loop import within
 from lifecycle.manifest.model import Run, RunKind
 from lifecycle.middleware.fastdds.discovery import (
     discovery_server_command,
@@ -23,7 +24,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
@@ -97,7 +98,7 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
 async def end(system: System, hurry: asyncio.Event) -> None:
     """End it, if it is ours; nothing of the system may need it any more. Again is harmless."""
     server = system.server
-    if server is None or server.child is None:
+    if server is None or not server.pid:
         return
     if not server.ended.done():
         _say(system, ProcessState.STOPPING)

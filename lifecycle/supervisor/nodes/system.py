@@ -25,13 +25,13 @@ from lifecycle.plan.parameters import DEFAULT
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
 from lifecycle.supervisor.core.state import Level, Node, Run, new_run
-from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
     ControlDriver,
     NodeDriver,
 )
+from lifecycle.supervisor.nodes.liveliness import SilenceMonitor
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
@@ -128,8 +128,7 @@ class NodeRun:
 
     def run_delays_s(self) -> tuple[float, float]:
         """Return the run delays of ours and of its process: ready to run, but without CPU."""
-        child = None if self.process is None else self.process.child
-        return own_run_delay_s(), 0.0 if child is None else child.run_delay_s()
+        return own_run_delay_s(), 0.0 if self.process is None else self.process.run_delay_s()
 
     def where(self) -> str:
         """Return where it is in a step that takes long, for messages; empty if not known."""

@@ -1,8 +1,12 @@
-"""The supervisor's side of a fork server: processes are started over a socket.
+"""The supervisor's side of a fork server, and what is ended that its processes left behind.
 
 Owns: asking it to fork, following its children by pidfd, so that an end is noticed at once, and
-what they have started. A run whose fork server dies fails: its children become this process's own,
-and are ended. Must not import rclpy.
+finding, without guessing, what a run has started and what of a killed supervisor's is left. A
+process belongs to a run if it descends from the run's fork server, which adopts all that its
+descendants leave behind, or if its environment carries the run's id. Other children of this process
+do not: it may have become the supervisor by exec of a shell with background jobs. A pid alone never
+proves it. A run whose fork server dies fails: its children become this process's own, and are
+ended. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -10,31 +14,42 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import select
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
-from lifecycle.run_directory import PROCESS_VARIABLE, groups_of
+from lifecycle.run_directory import (
+    OWN_CHILD,
+    PROCESS_VARIABLE,
+    RUN_VARIABLE,
+    RunRecord,
+    boot_id,
+    groups_of,
+    is_process,
+    parent_of,
+)
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
     ChildReport,
     ForkRequest,
+    ForkServerProcess,
 )
-from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
-from lifecycle.supervisor.processes.orphans import (
-    Lineage,
-    end,
-    marked,
-    reap_adopted,
+from lifecycle.supervisor.processes.process import (
+    ManagedProcess,
+    ProcessExit,
+    run_delay_s,
+    scope,
 )
-from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit, run_delay_s
-from lifecycle.supervisor.processes.scope import scope
 
 _STATUS_WAIT_S = 1.0
 """The fork server reaps within microseconds; after this long its report does not come any more."""
@@ -42,8 +57,16 @@ _STATUS_WAIT_S = 1.0
 _LEFT_S = 0.5
 """Between asking what a process left to end and killing it: another waits to start in its place."""
 
+_ORPHAN_GRACE_S = 3.0
+"""Between asking an orphan to end and killing it."""
+
+_KILL_S = 5.0
+"""How long the kernel may take to end a killed process, before it is reported."""
+
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
+
+_LOOK_S = 0.02
 
 _READY_S = 10.0
 """A fork server serves after 0.2 s; a loaded machine takes longer."""
@@ -54,61 +77,12 @@ _FRESH_INTERPRETER = ("PYTHON", "LD_", "RMW_IMPLEMENTATION", "VIRTUAL_ENV")
 """Variables that act while an interpreter starts; a fork of a running one would ignore them."""
 
 
-class ForkServerChild:
-    """A process forked by the fork server.
+class _Child(NamedTuple):
+    """A process that was forked, and what it is followed by."""
 
-    Args:
-        process: what it is.
-        lineage: which processes descend from it.
-    """
-
-    def __init__(self, process: ManagedProcess, pid: int, pidfd: int, lineage: Lineage) -> None:
-        self.process = process
-        self.pid = pid
-        self._lineage = lineage
-        self._loop = asyncio.get_running_loop()
-        self.exited: asyncio.Future[ProcessExit] = self._loop.create_future()
-        self._pidfd = pidfd
-        self._loop.add_reader(pidfd, self._ended, _STATUS_WAIT_S)
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the child's group; harmless once it ended."""
-        if self.exited.done():
-            return
-        try:
-            os.killpg(self.pid, number)
-        except ProcessLookupError:
-            # It has not reached setsid yet, or only its pidfd is left of it.
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pidfd, number)
-
-    def run_delay_s(self) -> float:
-        """Return how long its threads, and those of its descendants, waited for a processor."""
-        return sum(map(run_delay_s, self._lineage.of(self.pid)))
-
-    def _ended(self, patience_s: float) -> None:
-        """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""
-        if self.exited.done():
-            return
-        self._loop.remove_reader(self._pidfd)
-        found = None
-        with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
-            found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
-        if found is not None:
-            is_exit = found.si_code == os.CLD_EXITED
-            kind = {"status" if is_exit else "signal": found.si_status}
-            self.settle(ProcessExit(**kind))
-        elif patience_s > 0:
-            self._loop.call_later(patience_s, self._ended, 0.0)
-        else:
-            self.settle(ProcessExit())
-
-    def settle(self, how: ProcessExit) -> None:
-        """Take how it ended."""
-        if not self.exited.done():
-            self._loop.remove_reader(self._pidfd)
-            os.close(self._pidfd)
-            self.exited.set_result(how)
+    process: ManagedProcess
+    pid: int
+    pidfd: int
 
 
 class ForkServer:
@@ -124,8 +98,8 @@ class ForkServer:
     def __init__(self, process: ForkServerProcess) -> None:
         self._process = process
         self._loop = asyncio.get_running_loop()
-        self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], ManagedProcess]] = {}
-        self._children: dict[int, ForkServerChild] = {}
+        self._pending: dict[int, tuple[asyncio.Future[int], ManagedProcess]] = {}
+        self._children: dict[int, _Child] = {}  # those that have not ended, by their requests
         self._next = 0
         # Of a shell that became this process by exec: no part of the run.
         self._foreign = Lineage().children(os.getpid())
@@ -181,8 +155,8 @@ class ForkServer:
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
-    ) -> ForkServerChild:
-        """Fork one process, in a session of its own.
+    ) -> int:
+        """Fork one process, in a session of its own; return its pid. Its end settles it.
 
         Args:
             process: what to start.
@@ -214,13 +188,29 @@ class ForkServer:
             no_new_privileges=run.no_new_privileges,
             grace_s=process.grace_s,
         )
-        born: asyncio.Future[ForkServerChild] = self._loop.create_future()
+        born: asyncio.Future[int] = self._loop.create_future()
         try:
             self._ask(to_json(message), descriptors)
             self._pending[message.id] = (born, process)
             return await born
         except BringUpError as error:
             raise BringUpError(f"cannot start process {process.name!r}: {error.message}") from error
+
+    def signal(self, pid: int, number: int) -> None:
+        """Send a signal to the group of a child; harmless once it ended."""
+        pidfd = next((each.pidfd for each in self._children.values() if each.pid == pid), None)
+        if pidfd is None:
+            return
+        try:
+            os.killpg(pid, number)
+        except ProcessLookupError:
+            # It has not reached setsid yet, or only its pidfd is left of it.
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, number)
+
+    def run_delay_s(self, pid: int) -> float:
+        """Return how long a process and its descendants have waited for a processor."""
+        return sum(map(run_delay_s, self._lineage.of(pid)))
 
     def belonging(self, processes: Mapping[int, str]) -> set[int]:
         """Return the pids of all that processes have started, whether they live or not.
@@ -232,7 +222,7 @@ class ForkServer:
             processes: names of planned processes by pid.
         """
         lineage = Lineage()
-        others = self._living() - processes.keys()
+        others = {each.pid for each in self._children.values()} - processes.keys()
         spared = {each for pid in others for each in lineage.of(pid)}
         names = set(processes.values())
         found = {pid for pid, name in marked(self._process.run_id).items() if name in names}
@@ -264,9 +254,6 @@ class ForkServer:
         reap_adopted((self.pid,))
         return ended
 
-    def _living(self) -> set[int]:
-        return {each.pid for each in self._children.values() if not each.exited.done()}
-
     def _reports(self) -> None:
         """Take the reports that have come."""
         while True:
@@ -292,7 +279,7 @@ class ForkServer:
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
         elif child is not None and report.status is not None:
-            child.settle(ProcessExit.from_wait(report.status))
+            self._settle(report.id, ProcessExit.from_wait(report.status))
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
         born, process = self._pending.pop(report.id)
@@ -300,14 +287,36 @@ class ForkServer:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ForkServerChild(process, report.pid, descriptors[0], self._lineage)
-        self._children[report.id] = child
-        child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
+        child = self._children[report.id] = _Child(process, report.pid, descriptors[0])
+        self._loop.add_reader(child.pidfd, self._gone, report.id, _STATUS_WAIT_S)
         if born.cancelled():
             # The caller has given up; a process that no caller knows must not live.
-            child.signal(signal.SIGKILL)
+            self.signal(child.pid, signal.SIGKILL)
         else:
-            born.set_result(child)
+            born.set_result(child.pid)
+
+    def _gone(self, number: int, patience_s: float) -> None:
+        """The pidfd of a child is readable. The fork server reports how, unless it is gone."""
+        if (child := self._children.get(number)) is None:
+            return
+        self._loop.remove_reader(child.pidfd)
+        found = None
+        with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
+            found = os.waitid(os.P_PIDFD, child.pidfd, os.WEXITED | os.WNOHANG)
+        if found is not None:
+            is_exit = found.si_code == os.CLD_EXITED
+            kind = {"status" if is_exit else "signal": found.si_status}
+            self._settle(number, ProcessExit(**kind))
+        elif patience_s > 0:
+            self._loop.call_later(patience_s, self._gone, number, 0.0)
+        else:
+            self._settle(number, ProcessExit())
+
+    def _settle(self, number: int, how: ProcessExit) -> None:
+        child = self._children.pop(number)
+        self._loop.remove_reader(child.pidfd)
+        os.close(child.pidfd)
+        child.process.settle(how)
 
     def _ended(self) -> None:
         """The fork server itself has ended: by now its children are ours."""
@@ -341,3 +350,111 @@ async def _until_none(left: Callable[[], Collection[int]]) -> tuple[int, ...]:
             break
         ended.update(found)
     return tuple(sorted(ended))
+
+
+def reap_adopted(spare: Iterable[int]) -> None:
+    """Bury ended orphans that the kernel gave us (PR_SET_CHILD_SUBREAPER).
+
+    While a program of OWN_CHILD runs they wait: for the next time, or for our own end.
+    """
+    if not OWN_CHILD.acquire(blocking=False):
+        return
+    try:
+        spared = set(spare)
+        for pid in Lineage().children(os.getpid()) - spared:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
+    finally:
+        OWN_CHILD.release()
+
+
+def end_run(record: RunRecord) -> tuple[int, ...]:
+    """End what is left of a run whose supervisor was killed; return the pids. Blocks."""
+    if record.boot_id != boot_id():
+        return ()
+    pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
+    pids |= marked(record.run_id).keys()
+    lineage = Lineage()
+    for pid in tuple(pids):
+        pids |= lineage.of(pid)
+    pids.discard(os.getpid())
+    return asyncio.run(end(pids, _ORPHAN_GRACE_S))
+
+
+class Lineage:
+    """Which processes descend from which, as it was at most `FRESH_S` ago: reading all costs ms."""
+
+    FRESH_S = 0.5
+
+    def __init__(self) -> None:
+        self._read_s = float("-inf")
+        self._children: dict[int, list[int]] = {}
+
+    def children(self, pid: int) -> set[int]:
+        """Return the children of a process, adopted ones included."""
+        if time.monotonic() - self._read_s > self.FRESH_S:
+            self._children = {}
+            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+                    self._children.setdefault(parent, []).append(int(entry))
+            self._read_s = time.monotonic()
+        return set(self._children.get(pid, ()))
+
+    def of(self, pid: int) -> set[int]:
+        """Return a process and all that descends from it."""
+        found: set[int] = set()
+        left = {pid}
+        while left:
+            found |= left
+            left = set().union(*map(self.children, left)) - found
+        return found
+
+
+def marked(run_id: str) -> dict[int, str]:
+    """Return the planned process whose name each process carries that carries the run's id."""
+    mark = f"{RUN_VARIABLE}={run_id}".encode()
+    prefix = f"{PROCESS_VARIABLE}=".encode()
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit() or int(entry.name) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            words = (entry / "environ").read_bytes().split(b"\0")
+            if mark in words:
+                names = [each.removeprefix(prefix) for each in words if each.startswith(prefix)]
+                found[int(entry.name)] = os.fsdecode(names[-1]) if names else ""
+    return found
+
+
+async def end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+    """End processes, killing what has not ended after `grace_s`; return those that lived."""
+    # Held by their pidfds, so that no signal can reach a later owner of a pid.
+    held: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            held[os.pidfd_open(pid)] = pid
+    try:
+        left = _living(held)
+        ended = tuple(sorted(held[each] for each in left))
+        for number, wait_s in ((signal.SIGTERM, grace_s), (signal.SIGKILL, _KILL_S)):
+            for each in left:
+                with contextlib.suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(each, number)
+                    # A stopped process ends only once it goes on.
+                    signal.pidfd_send_signal(each, signal.SIGCONT)
+            deadline = time.monotonic() + wait_s
+            while (left := _living(left)) and time.monotonic() < deadline:  # noqa: ASYNC110
+                await asyncio.sleep(_LOOK_S)
+        return ended
+    finally:
+        for each in held:
+            os.close(each)
+
+
+def _living(pidfds: Iterable[int]) -> list[int]:
+    """Return those whose processes have not ended: then a pidfd can be read."""
+    poll = select.poll()
+    for each in pidfds:
+        poll.register(each, select.POLLIN)
+    ended = {pidfd for pidfd, _ in poll.poll(0)}
+    return [each for each in pidfds if each not in ended]

@@ -1,11 +1,12 @@
 """The fork server's own process: forks the processes of a system.
 
-Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--programs]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and
-every child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports.
-Each child leads a session of its own. It adopts what
-its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is
-what the run started. If the supervisor vanishes it ends what is left of its children, bounded.
+Owns: starting it, first of all that a run does, so nothing here takes long to import; and what runs
+in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload] [--programs]`.
+That stays single-threaded and never calls rclpy.init, so that forking is safe and every child is a
+participant of its own; with `--preload` a forked host skips ~130 ms of imports. Each child leads a
+session of its own. It adopts what its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as
+it lives, what descends from it is what the run started. If the supervisor vanishes it ends what is
+left of its children, bounded.
 """
 
 from __future__ import annotations
@@ -16,24 +17,25 @@ import os
 import selectors
 import signal
 import socket
+import subprocess
 import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import NoReturn
 
 import msgspec
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import MiddlewareError
+from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.middleware.process.control import (
     adopt_orphans,
     drop_network_administration,
     limit_resources,
     refuse_new_privileges,
 )
-from lifecycle.supervisor.processes.fork_server_process import PRELOAD
+from lifecycle.run_directory import RUN_VARIABLE, new_run_id
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
@@ -89,8 +91,74 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
 SERVES = "serves"
 """A message: say that you serve."""
 
+_PRELOAD = "preload"
+"""Begins a message that names interface types, one a line; requests to fork are JSON."""
+
+_CLOSE_S = 1.0
+"""A fork server whose children have ended ends within milliseconds of its socket."""
+
+_MAIN = "lifecycle.supervisor.processes.fork_server_main"
+
+_OF_SERVICE_MANAGER = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""The supervisor's own, run/journal.py: a node that has them could report in its place."""
+
 _CHANGES = os.WNOHANG | os.WUNTRACED | os.WCONTINUED
 _WAKEUP_BYTES = 4096
+
+
+class ForkServerProcess:
+    """The operating system process of a fork server; can be started before there is an event loop.
+
+    Args:
+        preload: import rclpy and what every node has, to fork Python nodes.
+        without: variables of our environment that nothing it starts shall have.
+        programs: the supervisor programs networks: what that takes its children shall not have.
+
+    Attributes:
+        run_id: of the run that it is for.
+
+    Raises:
+        BringUpError: it cannot be started.
+    """
+
+    def __init__(
+        self, *, preload: bool = True, without: Collection[str] = (), programs: bool = False
+    ) -> None:
+        self.run_id = new_run_id()
+        self._preloads = preload
+        hidden = {*without, *_OF_SERVICE_MANAGER}
+        environment = {name: text for name, text in os.environ.items() if name not in hidden}
+        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        argv = [sys.executable, "-m", _MAIN, str(theirs.fileno())]
+        try:
+            self.popen = subprocess.Popen(
+                [*argv, *["--preload"] * preload, *["--programs"] * programs],
+                stdin=subprocess.DEVNULL,
+                env={**environment, RUN_VARIABLE: self.run_id},
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        except OSError as error:
+            self.socket.close()
+            raise BringUpError(f"cannot start the fork server: {error.strerror}") from error
+        finally:
+            theirs.close()
+
+    def preload(self, types: Collection[str]) -> None:
+        """Have it import interface types once, before it forks nodes that use them."""
+        if self._preloads and types:
+            # One that has died is noticed by what asks it to fork.
+            with contextlib.suppress(OSError):
+                self.socket.send("\n".join((_PRELOAD, *types)).encode())
+
+    def close(self) -> None:
+        """End it: it ends once its socket is closed and no child is left. Again is harmless."""
+        self.socket.close()
+        try:
+            self.popen.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.wait()
 
 
 class _ForkServer:
@@ -133,7 +201,7 @@ class _ForkServer:
         word, *lines = data.decode().split("\n")
         if word == SERVES:
             self._tell(ChildReport(id=0))
-        elif word == PRELOAD:
+        elif word == _PRELOAD:
             _preload(lines)
         return True
 

@@ -1,8 +1,9 @@
-"""One process of a system: how it is started, its output, its channel, and how it ended.
+"""One process of a system: its output, its channel, its scope, and how it ended.
 
-Owns: `ManagedProcess`, and how long a process was ready to run but had no CPU, which counts in no
-deadline. When it is started and ended is the core's; what starts it is fork_server.py, or a test.
-Must not import rclpy.
+Owns: `ManagedProcess`; how long a process was ready to run but had no CPU, which counts in no
+deadline; and the scopes of systemd, which limit what a process and all that it starts may use
+(systemd-run(1), systemd.resource-control(5)). When it is started and ended is the core's; what
+starts it is fork_server.py, or a test. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ import asyncio
 import contextlib
 import functools
 import os
+import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from lifecycle.manifest.model import Output
+from lifecycle.manifest.model import Output, Resources
 from lifecycle.middleware.process.busy_sign import brief
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.printable import log_line
@@ -31,9 +33,12 @@ from lifecycle.supervisor.processes.logs import (
     Traceback,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerChild
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 
 class ProcessExit(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,7 +106,7 @@ class ManagedProcess:
         planned: what the plan declares of it.
         environment: (name, value) on top of the supervisor's own environment.
         channel: to our host; None for a foreign command.
-        child: None before it was spawned.
+        pid: process id; 0 before it was spawned.
         ended: resolves with how it ended.
         on_stop: called with True when a signal stopped it, False when it continues; set before
             `spawn`.
@@ -123,7 +128,8 @@ class ManagedProcess:
         self.grace_s = grace_s
         self.environment = tuple({**dict(variables), **dict(planned.environment)}.items())
         self.channel: ControlChannel | None = None
-        self.child: ForkServerChild | None = None
+        self.pid = 0
+        self._spawner: ForkServer | None = None
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.started_s = emit.elapsed_s
         self.last_stderr = ""
@@ -139,11 +145,6 @@ class ManagedProcess:
     def name(self) -> str:
         """The planned name."""
         return self.planned.name
-
-    @property
-    def pid(self) -> int:
-        """Process id; 0 before it was spawned."""
-        return 0 if self.child is None else self.child.pid
 
     def where(self) -> str:
         """Return where a callback of it stands, in short, and write all of it into the log.
@@ -174,21 +175,31 @@ class ManagedProcess:
             if channel is not None:
                 self.channel = channel
                 control = await channel.open()
-            self.child = await spawner.spawn(
+            self.pid = await spawner.spawn(
                 self, ends, None if control is None else control.fileno()
             )
+            self._spawner = spawner
         finally:
             for descriptor in ends:
                 os.close(descriptor)
             if control is not None:
                 control.close()
         self.started_s = self._emit.elapsed_s
-        self.child.exited.add_done_callback(self._exited)
 
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
-        if self.child is not None:
-            self.child.signal(number)
+        if self._spawner is not None and not self.ended.done():
+            self._spawner.signal(self.pid, number)
+
+    def run_delay_s(self) -> float:
+        """Return how long its threads, and those of its descendants, waited for a processor."""
+        return 0.0 if self._spawner is None else self._spawner.run_delay_s(self.pid)
+
+    def settle(self, how: ProcessExit) -> None:
+        """Take how it ended, after what it wrote before; called by what spawned it."""
+        for each in self._readers:
+            each.drain()
+        self.ended.set_result(how)
 
     @property
     def last_words(self) -> str:
@@ -203,11 +214,6 @@ class ManagedProcess:
         text = self._traceback.last if end.signal is None else ""
         text = log_line(text or self.last_stderr.strip())
         return text if len(text) <= _LONGEST_WORDS else f"{text[: _LONGEST_WORDS - 1]}…"
-
-    def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
-        for each in self._readers:
-            each.drain()
-        self.ended.set_result(exited.result())
 
     async def release(self) -> None:
         """Let go of its channel, its output and its logs, once it has ended or was never there."""
@@ -253,3 +259,57 @@ def _run_delay_ns(path: str) -> int:
         finally:
             os.close(descriptor)
     return 0
+
+
+def why_unlimited() -> str:
+    """Return why no process can have a scope here; empty if they can."""
+    folder = "/run"
+    if os.geteuid():
+        folder = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}"
+    if not Path("/run/systemd/system").is_dir():  # sd_booted(3)
+        return "systemd does not run here"
+    if shutil.which("systemd-run") is None:
+        return "there is no systemd-run here"
+    if not Path(folder, "systemd", "private").exists():
+        return f"this user has no service manager here ({folder}/systemd)"
+    return ""
+
+
+def scope(resources: Resources | None) -> tuple[str, ...]:
+    """Return the words before a command that limit it; none where nothing is to, or can be.
+
+    The command replaces systemd-run: it has its pid, descriptors, session and environment.
+    """
+    properties = () if resources is None else resources.properties()
+    if not properties or why_unlimited():
+        return ()
+    user = ("--user",) if os.geteuid() else ()
+    limits = (f"--property={each}" for each in properties)
+    return ("systemd-run", "--scope", "--quiet", "--collect", *user, *limits, "--")
+
+
+def unlimited(processes: Iterable[PlannedProcess]) -> tuple[Finding, ...]:
+    """Return an unverifiable finding for each of these processes that nothing limits as declared.
+
+    Args:
+        processes: of this host.
+    """
+    limited = [
+        (each.name, each.run.resources)
+        for each in processes
+        if each.run.resources is not None and each.run.resources.properties()
+    ]
+    why = why_unlimited() if limited else ""
+    return tuple(
+        rule("declaration.unproven").finding(
+            outcome=Outcome.UNVERIFIABLE,
+            subject=name,
+            expected=f"limited: {', '.join(resources.properties())}",
+            observed="run.resources",
+            message=f"cannot limit the resources of process {name!r}: {why}",
+            at=resources.at,
+            hint="start lifecycle where systemd runs, or limit the whole container",
+        )
+        for name, resources in limited
+        if why
+    )

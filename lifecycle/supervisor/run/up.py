@@ -47,6 +47,7 @@ from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (
+    FORK_SERVER,
     RunDirectory,
     RunRecord,
     boot_id,
@@ -58,15 +59,14 @@ from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
+from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     begin_logs,
     check_log_root,
     forget_runs,
     log_directory,
 )
-from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
@@ -78,7 +78,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended_early
-from lifecycle.supervisor.run.journal import Journal
+from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     Until,
     UpOptions,
@@ -88,8 +88,6 @@ from lifecycle.supervisor.run.options import (
     observer_connections,
     own_machines,
 )
-from lifecycle.supervisor.run.records import Records
-from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 
@@ -139,9 +137,8 @@ def up(
             where Fast DDS hangs in that, this process ends with that exit code after `LEAVE_S`.
 
     Raises:
-        AlreadyRunningError: another supervisor has this system in this domain.
-        UsageError: the plan has nothing for this host, the run directory or the options of a
-            network to program cannot be used.
+        UsageError: another supervisor has this system in this domain, the plan has nothing for
+            this host, the run directory or the options of a network to program cannot be used.
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
     """
@@ -157,6 +154,7 @@ def up(
         run_name(plan, options.machine),
         process.run_id,
         domain_id=plan.domain_id,
+        processes={process.popen.pid: FORK_SERVER},
     )
     journal = Journal(
         plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
@@ -185,8 +183,6 @@ def up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
-            records = Records(directory, system, fork_server)
-            records.write()
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
@@ -198,7 +194,6 @@ def up(
                     system,
                     Means(
                         directory=directory,
-                        records=records,
                         fork_server=fork_server,
                         participant=observer_participant,
                         networks=networks,

@@ -22,10 +22,10 @@ from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
-from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.nodes.liveliness import arrivals
 from lifecycle.supervisor.nodes.system import reached
-from lifecycle.supervisor.processes.scope import unlimited
+from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.shell.grace_period import GracePeriod
 from lifecycle.supervisor.shell.standstill import Standstill
 from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured

@@ -15,7 +15,7 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.node.host.control import HostSpec, Operation
-from lifecycle.run_directory import start_ticks
+from lifecycle.run_directory import FORK_SERVER, start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -52,6 +52,7 @@ class Processes:
         self._system = shell.system
         self._means = shell.means
         self._belonging: dict[str, set[int]] = {}  # what processes had started as they were ended
+        self._is_recorded = True
         self.releasing: list[asyncio.Task[None]] = []
 
     def spawn(self, effect: effects.Spawn) -> None:
@@ -97,7 +98,25 @@ class Processes:
         self._shell.give(
             inputs.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
         )
-        self._means.records.write()
+        self._record()
+
+    def _record(self) -> None:
+        """Write down which processes run, for who finds them should this supervisor be killed."""
+        directory = self._means.directory
+        names = {each.pid: each.name for each in self._system.living}
+        try:
+            directory.record({**names, self._means.fork_server.pid: FORK_SERVER})
+        except OSError as error:
+            if self._is_recorded:
+                text = (
+                    f"cannot write {str(directory.path / 'record.json')!r}: {error.strerror}; the "
+                    "run goes on, but should this supervisor be killed, the next one may not find "
+                    "all that it leaves"
+                )
+                self._system.emit(Notice(message=text))
+            self._is_recorded = False
+        else:
+            self._is_recorded = True
 
     def _apart(self, process: ManagedProcess) -> tuple[str, ...]:
         """Return the topics whose messages come by the clock of another host."""

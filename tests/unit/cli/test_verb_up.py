@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import up
 from lifecycle.errors import ExitCode, UsageError
 
-FORK_SERVER = "lifecycle.supervisor.processes.fork_server_process.ForkServerProcess"
+FORK_SERVER = "lifecycle.supervisor.processes.fork_server_main.ForkServerProcess"
 
 
 class _NoForkServer:

@@ -163,9 +163,10 @@ class FakeProcess:
         self, spawner: FakeForkServer, process: ManagedProcess, stdout: int, control: int | None
     ) -> None:
         self.pid = spawner.next_pid()
-        self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.signals: list[int] = []
+        self.has_ended = False
         self._spawner = spawner
+        self._process = process
         self._name = process.name
         self._stdout = os.dup(stdout)
         self._task: asyncio.Task[None] | None = None
@@ -187,13 +188,14 @@ class FakeProcess:
         return share * asyncio.get_running_loop().time()
 
     def end(self, how: ProcessExit) -> None:
-        if not self.exited.done():
+        if not self.has_ended:
+            self.has_ended = True
             if self._task is not None:
                 self._task.cancel()
             if self._host is not None:
                 self._host.close()  # it ended before it served
             os.close(self._stdout)
-            self.exited.set_result(how)
+            self._process.settle(how)
             self._spawner.gone(self._name)
 
     def say(self, line: str) -> None:
@@ -303,6 +305,7 @@ class FakeForkServer:
         self.cannot_start = ""
         self.lingers_s = 0.0
         self.processes: dict[str, FakeProcess] = {}
+        self._by_pid: dict[int, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
@@ -363,9 +366,16 @@ class FakeForkServer:
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
-    ) -> FakeProcess:
-        child = self.processes[process.name] = FakeProcess(self, process, streams[0], control)
-        return child
+    ) -> int:
+        made = self.processes[process.name] = FakeProcess(self, process, streams[0], control)
+        self._by_pid[made.pid] = made
+        return made.pid
+
+    def signal(self, pid: int, number: int) -> None:
+        self._by_pid[pid].signal(number)
+
+    def run_delay_s(self, pid: int) -> float:
+        return self._by_pid[pid].run_delay_s()
 
     def family(self) -> frozenset[int]:
         """They have started nothing."""

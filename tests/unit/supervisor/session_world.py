@@ -61,7 +61,6 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
@@ -505,7 +504,6 @@ class SessionWorld(World):
         with self.ending, self._run_directory() as directory, kept:
             means = Means(
                 directory=directory,
-                records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
                 networks=FakeNetworks(self.hosts),
@@ -608,7 +606,7 @@ class SessionWorld(World):
         assert self.story[-1] == f"[stopped] {exit_code}"
         assert self.result.verdict.run.exit_code == exit_code
         assert self.story.count("networks restored") == 1
-        assert all(each.exited.done() for each in self.hosts.processes.values())
+        assert all(each.has_ended for each in self.hosts.processes.values())
         assert self._stopping_at_s is not None
         assert self.emit.elapsed_s - self._stopping_at_s < SHUTDOWN_S
         self._check_gate()

@@ -20,10 +20,10 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Resources, Run, RunKind
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
-from lifecycle.supervisor.processes import logs, scope
+from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
+from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
     LineReader,
@@ -32,8 +32,7 @@ from lifecycle.supervisor.processes.logs import (
     Traceback,
     ros_log_root,
 )
-from lifecycle.supervisor.processes.orphans import end_run
-from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit, scope, unlimited
 from lifecycle.supervisor.run.events import Emitter, LogLine
 from lifecycle.verify.outcome import Outcome
 from tests.builders import planned_node
@@ -42,6 +41,7 @@ from tests.unit.supervisor.fakes import host_spec
 PYTHON = sys.executable
 BOUND_S = 20.0
 REAL_TIME = True
+WHY_UNLIMITED = "lifecycle.supervisor.processes.process.why_unlimited"
 
 
 class _Bench:
@@ -345,7 +345,7 @@ async def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descript
     program.write_text(_SYSTEMD_RUN.format(log=log))
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setattr(scope, "why_unlimited", lambda: "")
+    monkeypatch.setattr(WHY_UNLIMITED, lambda: "")
     resources = Resources(at=Position(file="m", line=1, column=1), memory_max_mib=64, tasks_max=9)
 
     async with _Bench(tmp_path) as bench:
@@ -371,14 +371,14 @@ def test_limits_that_nothing_sets_are_unverifiable(monkeypatch: pytest.MonkeyPat
             ("others", Run(kind=RunKind.ATTACH)),
         )
     ]
-    monkeypatch.setattr(scope, "why_unlimited", lambda: "systemd does not run here")
-    (found,) = scope.unlimited(processes)
+    monkeypatch.setattr(WHY_UNLIMITED, lambda: "systemd does not run here")
+    (found,) = unlimited(processes)
     assert (found.rule, found.outcome) == ("declaration.unproven", Outcome.UNVERIFIABLE)
     assert (found.subject, found.at, found.expected) == ("it", "m:1:1", "limited: TasksMax=9")
     assert found.message == "cannot limit the resources of process 'it': systemd does not run here"
-    assert scope.scope(processes[0].run.resources) == ()
-    monkeypatch.setattr(scope, "why_unlimited", lambda: "")
-    assert scope.unlimited(processes) == ()
+    assert scope(processes[0].run.resources) == ()
+    monkeypatch.setattr(WHY_UNLIMITED, lambda: "")
+    assert unlimited(processes) == ()
 
 
 FRAMES = """\
