@@ -26,8 +26,8 @@ from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory, participant_settings
 from lifecycle.network.nfe import NetworkFlowEndpoint
+from lifecycle.verify.network_flows import carrier
 from lifecycle.verify.observation import Identity
-from lifecycle.verify.transport import carrier
 
 HERE = Path(__file__).parent
 QOS = QosProfile()
