@@ -25,7 +25,7 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
-from lifecycle.plan.participants import find_executable
+from lifecycle.plan.processes import find_executable
 from lifecycle.plan.python_source import (
     ClassKind,
     NodeClass,
