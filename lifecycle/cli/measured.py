@@ -15,8 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lifecycle.errors import UsageError
-from lifecycle.measure.bounds import Kind
-from lifecycle.measure.flows import NUMBERS, FlowMeasurement
+from lifecycle.measure.flows import NUMBERS, FlowMeasurement, Kind
 
 _MARKS = {
     "violated": ("!", "\x1b[31m"),

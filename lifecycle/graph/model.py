@@ -16,10 +16,10 @@ from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.network.nfe import FlowTuple, flow_tuples
+from lifecycle.verify.network_flows import NONE, carrier
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.matching import match, obstacle
-from lifecycle.verify.transport import NONE, carrier
 from lifecycle.verify.view import SeenEndpoint
 
 

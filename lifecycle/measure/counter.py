@@ -12,8 +12,18 @@ from collections import Counter as Counts
 from collections import deque
 from collections.abc import Iterable, Mapping
 
-from lifecycle.measure.delays import LONGEST_NS, Delays, buckets_of, least_ns, signed_buckets_of
-from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Sample, Slot
+from lifecycle.measure.sample import (
+    DELAY_MESSAGES,
+    DELAY_S,
+    LONGEST_NS,
+    SLOT_S,
+    Delays,
+    Sample,
+    Slot,
+    buckets_of,
+    least_ns,
+    signed_buckets_of,
+)
 
 WARM_UP_S = 0.5
 """What arrives so soon after activation is not counted: others are being activated meanwhile."""

@@ -1,19 +1,264 @@
-"""What was measured of flows: what status, verdicts, diagnostics and records show. Pure.
+"""Declared numbers of flows: whether each is kept once a sample can decide, and how it is shown.
 
-Apart from verdicts because `lifecycle status` shows it, which loads no plan and no rule.
+A delay needs 200 messages or 5 s, a loss 10 / bound messages, a rate 2 s and 20 periods. Until then
+nothing is said of it, as a canary analysis says nothing before its first interval is over. Where
+few messages decide, more of them must be late or lost than chance explains. Loads no plan and no
+rule: `lifecycle status` shows what was measured. Pure.
 """
 
 from __future__ import annotations
 
+import enum
+import math
 from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
 
 from lifecycle.codec import Count, says
-from lifecycle.measure.bounds import Kind, apart
-from lifecycle.measure.clock import ClockOffset
+from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
+from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, ERROR, Delays, Sample
 from lifecycle.printable import count
+
+RATE_S = 2.0
+RATE_PERIODS = 20
+LOSS_EVENTS = 10
+"""A share is known once so many losses would have been seen at the bound."""
+
+CLOCKS_S = 8.0
+"""A delay that the clocks of two hosts do not let decide is waited for so long: within the
+probation of a system."""
+
+_ONE_PERCENT = 2.326
+"""So many standard deviations above the mean are 1 % of a normal distribution."""
+
+REPORTED_S = 1.0
+"""The reports of two nodes are of moments that are less than this apart."""
+
+
+class Kind(enum.Enum):
+    """What is measured."""
+
+    DELAY = "delay"  # from publication to the start of the callback
+    NETWORK_DELAY = "network delay"  # from publication to reception by the RMW
+    RATE = "rate"
+    LOSS = "loss"
+    SILENCE = "silence"
+
+
+class Bound(msgspec.Struct, frozen=True, kw_only=True):
+    """A declared number.
+
+    Attributes:
+        kind: what it bounds.
+        least: lower bound, of a rate: hertz; None without.
+        most: upper bound, of a delay milliseconds, of a rate hertz, of a loss a share, of a silence
+            seconds; None without.
+        slack: share of `least` that may be missing.
+        quantile: of a delay.
+    """
+
+    kind: Kind
+    least: float | None = None
+    most: float | None = None
+    slack: float = 0.0
+    quantile: float = 0.99
+
+
+class Judgement(msgspec.Struct, frozen=True, kw_only=True):
+    """What a sample says of a bound.
+
+    Attributes:
+        kept: None while the sample cannot decide.
+        observed: `delay p99 0.6 ms`; empty while nothing is known.
+        allowed: `≤ 5 ms`.
+        share: what was observed, divided by the bound; None while nothing is known.
+        decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
+            where that is not known.
+        needs_clocks: the sample is large enough to decide, but too little is known of the clocks of
+            the two hosts.
+    """
+
+    kept: bool | None
+    observed: str
+    allowed: str
+    share: float | None = None
+    decides_in_s: float | None = None
+    needs_clocks: bool = False
+
+
+def judge(
+    bound: Bound,
+    sample: Sample,
+    *,
+    publishes_s: float | None = None,
+    clock: ClockOffset | None = SAME_CLOCK,
+) -> Judgement:
+    """Judge a bound by what a subscription has counted.
+
+    Args:
+        bound: what is declared.
+        sample: of the subscription.
+        publishes_s: for how long its publisher has been let publish, seconds; None if not known.
+        clock: of its publisher's host; None if not known.
+    """
+    if bound.kind is Kind.DELAY:
+        return _delay(bound, sample, sample.used, clock)
+    if bound.kind is Kind.NETWORK_DELAY:
+        return _delay(bound, sample, sample.received, clock)
+    if bound.kind is Kind.RATE:
+        return _rate(bound, sample, publishes_s)
+    if bound.kind is Kind.LOSS:
+        return _loss(bound, sample)
+    return _silence(bound, sample, publishes_s)
+
+
+def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | None) -> Judgement:
+    assert bound.most is not None
+    found, kept, observed = delays.quantile_ms(bound.quantile), None, ""
+    share: float | None = None
+    is_enough = found is not None and (
+        delays.messages >= DELAY_MESSAGES or delays.seconds >= DELAY_S
+    )
+    if found is not None and clock is not None:
+        delay_ms, unsure_ms = max(0.0, found + clock.offset_ms), clock.uncertainty_ms
+        observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
+        share = delay_ms / bound.most
+        if clock.uncertainty_ms:
+            # The bucket from which it was read is as large as this at most.
+            unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
+            observed += f" ± {ms(unsure_ms)}"
+        is_late = delay_ms - unsure_ms > bound.most
+        if is_late and delays.messages < DELAY_MESSAGES:
+            late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
+            is_enough = is_enough and late >= too_many(delays.messages, 1 - bound.quantile)
+        if is_enough and is_late:
+            kept = False
+        elif is_enough and delay_ms + unsure_ms <= bound.most:
+            kept = True
+    needs_clocks = is_enough and kept is None
+    decides_in_s: float | None = None
+    if needs_clocks and sample.seconds < CLOCKS_S:
+        decides_in_s = CLOCKS_S - sample.seconds
+    elif not is_enough and delays.seconds < DELAY_S:
+        decides_in_s = DELAY_S - delays.seconds
+    return Judgement(
+        kept=kept,
+        observed=observed,
+        allowed=_limit("≤", ">", kept, ms(bound.most)),
+        share=share,
+        decides_in_s=decides_in_s,
+        needs_clocks=needs_clocks,
+    )
+
+
+def too_many(messages: int, share: float) -> int:
+    """Return how many late or lost messages are no chance any more, where a share of all may be.
+
+    Were each one with that probability, so many would be in 1 % of samples at most. The normal
+    approximation of the binomial distribution, and 2 more because that is skewed.
+
+    Args:
+        messages: > 0, of the sample; that all are is never chance.
+        share: > 0 and < 1.
+    """
+    expected = messages * share
+    spread = math.sqrt(expected * (1 - share))
+    return min(messages, int(expected + _ONE_PERCENT * spread + 2))
+
+
+def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
+    slowest = bound.least if bound.least is not None else bound.most
+    assert slowest is not None
+    needed_s = max(RATE_S, RATE_PERIODS / slowest)
+    seen = sample.last(seconds=needed_s)
+    new = publishes_s is not None and publishes_s < seen.seconds + REPORTED_S
+    decided = seen.seconds >= needed_s and not new
+    least = 0.0 if bound.least is None else bound.least * (1 - bound.slack)
+    # Where a slot begins and ends makes a difference of one message.
+    low = seen.messages + 1 < least * seen.seconds
+    high = bound.most is not None and seen.messages - 1 > bound.most * seen.seconds
+    limit = slowest
+    if bound.most is not None and (high or bound.least is None):
+        limit = bound.most
+        allowed = _limit("≤", ">", not high, f"{bound.most:g} Hz")
+    else:
+        slack = f" - {bound.slack:.0%}" if bound.slack else ""
+        allowed = _limit("≥", "<", not low, f"{bound.least:g} Hz{slack}")
+    left_s = max(needed_s - seen.seconds, REPORTED_S) + (needed_s if new else 0.0)
+    return Judgement(
+        kept=not (low or high) if decided else None,
+        observed=f"{seen.rate_hz:.1f} Hz" if seen.seconds else "",
+        allowed=allowed,
+        share=seen.rate_hz / limit if seen.seconds else None,
+        decides_in_s=None if decided else left_s,
+    )
+
+
+def _loss(bound: Bound, sample: Sample) -> Judgement:
+    assert bound.most is not None
+    needed = LOSS_EVENTS / bound.most
+    seen, kept = sample.last(published=needed), _loses_less(bound.most, needed, sample)
+    # More were lost than allowed, but no more than by chance: a longer past decides.
+    while kept is None and seen.published >= needed:
+        needed *= 2
+        seen, kept = sample.last(published=needed), _loses_less(bound.most, needed, sample)
+    left = needed - seen.published
+    return Judgement(
+        kept=kept,
+        observed=lost(seen.lost, seen.published) if seen.published else "",
+        allowed=_limit("≤", ">", kept, f"{bound.most:.6g}"),
+        share=seen.lost / seen.published / bound.most if seen.published else None,
+        decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
+    )
+
+
+def _loses_less(share: float, needed: float, sample: Sample) -> bool | None:
+    """Return whether no more than a share was lost of so many messages; None if it is open."""
+    seen = sample.last(published=needed)
+    if seen.lost >= too_many(math.ceil(max(seen.published, needed)), share):
+        return False  # whatever else arrives
+    return True if seen.published >= needed and seen.lost <= share * seen.published else None
+
+
+def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
+    assert bound.most is not None
+    silent_s = sample.silent_s
+    if publishes_s is not None:
+        silent_s = min(silent_s, max(0.0, publishes_s - REPORTED_S))
+    kept = False if silent_s > bound.most else (True if sample.messages else None)
+    return Judgement(
+        kept=kept,
+        observed=f"silent for {silent_s:.1f} s",
+        allowed=_limit("≤", ">", kept, f"{bound.most:g} s"),
+        share=silent_s / bound.most,
+        decides_in_s=bound.most - silent_s if kept is None else None,
+    )
+
+
+def _limit(keeps: str, breaks: str, kept: bool | None, text: str) -> str:
+    return f"{breaks if kept is False else keeps} {text}"
+
+
+def percentile(quantile: float) -> str:
+    """Return `p99` for 0.99, `p99.9` for 0.999."""
+    return f"p{quantile * 100:g}"
+
+
+def ms(value: float) -> str:
+    """Return milliseconds as people read them, `0.61 ms`."""
+    return f"{value:.3g} ms" if value < 1000 else f"{value:.0f} ms"
+
+
+def lost(number: int, published: int) -> str:
+    """Return `0 of 74 lost`."""
+    return f"{number} of {published} lost"
+
+
+def apart(clock: ClockOffset) -> str:
+    """Return how far two clocks are apart, `512 ms ± 3.1 ms`."""
+    return f"{ms(abs(clock.offset_ms))} ± {ms(clock.uncertainty_ms)}"
+
 
 Pair = tuple[str, str, str]
 """Of a flow its topic, and the full names of the nodes that publish and subscribe."""

@@ -1,13 +1,123 @@
-"""What a subscription has counted, as its node reports it: windows of the recent past. Pure."""
+"""What a subscription has counted, as its node reports it: recent windows, quantiles of delays.
+
+Delays are in a histogram of constant size, which divides each doubling of a delay into 64 parts, so
+that a quantile that is read from it is at most 1/64 below the exact one. Pure.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import Annotated
 
 import msgspec
 
 from lifecycle.codec import Count
-from lifecycle.measure.delays import Delays
+
+_PART_BITS = 6
+_PARTS = 1 << _PART_BITS
+
+LONGEST_NS = (1 << 43) - 1
+"""Longer delays, more than two hours, count as this one."""
+
+ERROR = 1 / _PARTS
+"""A quantile is at most this share below the exact one, and never above it."""
+
+_NS_PER_MS = 1e6
+
+
+def buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of delays; what seems to arrive before it was sent counts as 0 ns."""
+    return [
+        ((shift := each.bit_length() - _PART_BITS - 1) << _PART_BITS) + (each >> shift)
+        if each >= _PARTS
+        else max(each, 0)
+        for each in delays_ns
+    ]
+
+
+def signed_buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of differences of two delays, which may be negative."""
+    return [
+        bucket if each >= 0 else -bucket
+        for each in delays_ns
+        for bucket in buckets_of((abs(each),))
+    ]
+
+
+def least_ns(bucket: int) -> int:
+    """Return the shortest delay of a bucket."""
+    if bucket < 0:
+        return 1 - least_ns(1 - bucket)
+    shift = max((bucket >> _PART_BITS) - 1, 0)
+    return (bucket - (shift << _PART_BITS)) << shift
+
+
+(LAST_BUCKET,) = buckets_of((LONGEST_NS,))
+
+Bucket = Annotated[int, msgspec.Meta(ge=-LAST_BUCKET, le=LAST_BUCKET)]
+
+
+class Delays(msgspec.Struct, frozen=True, kw_only=True):
+    """Delays of some messages.
+
+    Attributes:
+        seconds: how long it took them all to arrive.
+        buckets: those with delays in them, in order, and how many there are in each.
+        shift_ns: added to each of those of a publisher on another host: how far its clock is ahead
+            is not known where they are counted, and small delays have small buckets; None where
+            all are of one clock.
+    """
+
+    seconds: float = 0.0
+    buckets: tuple[tuple[Bucket, Count], ...] = ()
+    shift_ns: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        counts: Iterable[dict[int, int]],
+        *,
+        seconds: float = 0.0,
+        shift_ns: int | None = None,
+    ) -> Delays:
+        """Add up histograms, each the number of delays by bucket."""
+        total: dict[int, int] = {}
+        for each in counts:
+            for found, number in each.items():
+                bucket = max(-LAST_BUCKET, min(found, LAST_BUCKET))
+                total[bucket] = total.get(bucket, 0) + number
+        return cls(seconds=seconds, buckets=tuple(sorted(total.items())), shift_ns=shift_ns)
+
+    @property
+    def messages(self) -> int:
+        """How many messages."""
+        return sum(number for _, number in self.buckets)
+
+    def quantile_ms(self, quantile: float) -> float | None:
+        """Return the delay, milliseconds, that a share of the messages does not exceed.
+
+        By nearest rank; the largest of several delays is left out, because one late message is no
+        quantile. None without messages.
+
+        Args:
+            quantile: > 0 and < 1, 0.99 for p99.
+        """
+        messages = self.messages
+        if messages == 0:
+            return None
+        rank = min(max(math.ceil(quantile * messages - 1e-9), 1), max(messages - 1, 1))
+        for bucket, number in self.buckets:
+            rank -= number
+            if rank <= 0:
+                return (least_ns(bucket) + (self.shift_ns or 0)) / _NS_PER_MS
+        raise AssertionError("the ranks of a histogram end with its messages")
+
+    def later_than(self, ms: float) -> int:
+        """Return how many messages were later than this for certain, milliseconds."""
+        longest_ns = ms * _NS_PER_MS - (self.shift_ns or 0)
+        return sum(number for bucket, number in self.buckets if least_ns(bucket) > longest_ns)
+
 
 SLOT_S = 0.5
 """Messages are counted in slots of this length."""

@@ -2,7 +2,7 @@
 
 Owns: the one enum of media, with what others ask of each; `FlowTransport`, the values of a
 manifest's `transport:`; MTU, and what of a datagram IP fragments. Which medium two ends get, and
-why, is in `plan.negotiation.media`. Pure.
+why, is in `plan.media`. Pure.
 
 A UDP datagram that does not fit the path's MTU is split by IP. Only the first fragment carries the
 ports, so that a rule on ports treats the others as something else, and one lost fragment loses them

@@ -46,7 +46,6 @@ from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
-from lifecycle.plan.connections.wiring import variables_of, wire
 from lifecycle.plan.model import (
     HeldBy,
     Plan,
@@ -55,12 +54,13 @@ from lifecycle.plan.model import (
     PlannedFile,
     PlannedFlow,
     PlannedNode,
-    PlannedProcess,
     declared,
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters, portable
-from lifecycle.plan.participants import command_line, place
+from lifecycle.plan.participants import place
+from lifecycle.plan.processes import planned_processes
+from lifecycle.plan.wiring import variables_of, wire
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
@@ -132,58 +132,6 @@ def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
         transport=next(iter(asked), FlowTransport.ANY),
         quantities=tuple(each for link in named for each in link.quantities),
     )
-
-
-def planned_processes(
-    nodes: Sequence[Node],
-    *,
-    domain_id: int,
-    discovery_range: DiscoveryRange,
-    environment: Mapping[str, str],
-    connecting: Sequence[tuple[str, str]] = (),
-    shared_memory: bool = False,
-) -> tuple[PlannedProcess, ...]:
-    """Group nodes by process, in the order in which the manifest first names each process.
-
-    Args:
-        nodes: in manifest order.
-        domain_id: given to every process.
-        discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
-            that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
-            127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.
-        environment: where AMENT_PREFIX_PATH is looked up.
-        connecting: variables that connect commands, whose participants are their own code's.
-        shared_memory: own participants have nothing else.
-
-    Raises:
-        PlanError: an executable cannot be found.
-    """
-    groups: dict[str, list[Node]] = {}
-    for node in nodes:
-        groups.setdefault(node.process_name, []).append(node)
-
-    def process(name: str, group: Sequence[Node]) -> PlannedProcess:
-        run = group[0].run
-        is_command = run.kind is RunKind.COMMAND
-        near = is_command and shared_memory and discovery_range is DiscoveryRange.LOCALHOST
-        reach = DiscoveryRange.SYSTEM_DEFAULT if near else discovery_range
-        return PlannedProcess(
-            name=name,
-            machine=group[0].machine,
-            run=run,
-            nodes=tuple(node.key for node in group),
-            argv=(*run.prefix, *command_line(group, environment)) if is_command else (),
-            environment=tuple(
-                {
-                    **(dict(connecting) if is_command else {}),
-                    "ROS_DOMAIN_ID": str(domain_id),
-                    "ROS_AUTOMATIC_DISCOVERY_RANGE": reach.name,
-                    **dict(run.environment),
-                }.items()
-            ),
-        )
-
-    return tuple(process(name, group) for name, group in groups.items())
 
 
 def build_plan(

@@ -1,41 +1,34 @@
-"""Extra DDS participants for declared connections, and for flows that are unique or marked.
+"""Extra DDS participants: for declared and negotiated connections, for unique or marked flows.
 
-Owns: naming and describing the participants that `connections:` declares, and those that
-`manifest/flows.py` groups endpoints into; the command lines of processes. On Fast DDS a publisher
-sends from the sender sockets of its participant, so only one of its own makes it unique, and only
-all publishers of one participant together can carry a DSCP. From the same sockets subscriptions
-send their acknowledgements. Pure.
+On Fast DDS a publisher sends from the sender sockets of its participant, so only one of its own
+makes it unique, and only all publishers of one participant together can carry a DSCP. From the same
+sockets subscriptions send their acknowledgements. Pure.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.flows import ParticipantGroup
-from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
-    Node,
-    ParameterValue,
-    RosArguments,
-    Run,
 )
 from lifecycle.network.dscp import describe
-from lifecycle.plan.connections.control import participant_name
 from lifecycle.plan.model import (
     ParticipantConnections,
-    PlanError,
     PlannedEndpoint,
+    PlannedNode,
     PlannedParticipant,
 )
+from lifecycle.plan.parties import NegotiatedConnection
 from lifecycle.printable import count
+
+
+def participant_name(node_name: str, connection: str) -> str:
+    """Return the base name of the hidden node that carries a connection, `_camera_net`."""
+    return f"_{node_name}_{connection}"
 
 
 def place(
@@ -121,92 +114,42 @@ def _reason(group: ParticipantGroup) -> str:
     return " ".join(facts)
 
 
-def command_line(nodes: Sequence[Node], environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the full argv of a COMMAND process, whose nodes share one `run:`.
+def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:
+    """Give a node the connections that were negotiated for it.
 
-    It is given ROS arguments only where a key of one of its nodes asks for them. Those of a process
-    with several nodes are for the one node alone; who is to be renamed is known by its key.
-
-    Raises:
-        PlanError: the package or its executable cannot be found.
+    An extra participant that made a publisher's flow unique and carries none any more is removed;
+    the publisher's connection takes its purpose.
     """
-    run = nodes[0].run
-    argv = list(run.command) or [find_executable(run, environment, at=nodes[0].at)]
-    given: list[str] = []
-    if run.ros_args is not RosArguments.NONE:
-        given = [word for node in nodes for word in _ros_arguments(node, alone=len(nodes) == 1)]
-        levels = dict.fromkeys(node.log_level for node in nodes if node.log_level)
-        given += [word for level in levels for word in ("--log-level", level)]
-    return tuple(argv + ["--ros-args"] * bool(given) + given)
+    places = {label: each for each in connections for label in each.map}
+    endpoints = []
+    carriers = {each.name: each for each in node.participants}
+    takes: dict[str, list[PlannedParticipant]] = {}
+    for each in node.endpoints:
+        connection = places.get(each.kind.spell(each.name))
+        if connection is None:
+            endpoints.append(each)
+            continue
+        if each.participant in carriers:
+            takes.setdefault(connection.name, []).append(carriers[each.participant])
+        name = participant_name(node.name, connection.name)
+        endpoints.append(replace(each, participant=name))
+    used = {each.participant for each in endpoints}
+    kept = [each for each in node.participants if each.connection or each.name in used]
+    made = [_participant(node.name, each, takes.get(each.name, ())) for each in connections]
+    return replace(node, endpoints=tuple(endpoints), participants=(*kept, *made))
 
 
-def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
-    """Yield what one node asks for. Files precede values, because rcl lets the later one win.
-
-    Name and namespace are given where the manifest writes them.
-    """
-    old = "" if alone else f"{node.key.rpartition('/')[2]}:"
-    own = "" if alone else f"{node.name}:"
-    if node.where("name") is not node.at:
-        yield from ("-r", f"{old}__node:={node.name}")
-    if node.namespace != "/" or node.where("namespace") is not node.at:
-        yield from ("-r", f"{own}__ns:={node.namespace}")
-    for source, target in node.remap:
-        rule = source if _NODE_PREFIX.match(source) else f"{own}{source}"
-        yield from ("-r", f"{rule}:={target}")
-    for file in node.parameter_files:
-        yield from ("--params-file", file)
-    # rcl 9.2 knows a value for one node by the name alone, and so has none for a namespace; the
-    # supervisor sets these.
-    for name, value in node.parameters if alone or node.namespace == "/" else ():
-        if value == ():
-            continue  # rcl has no empty array: `[]` takes the node's default from it
-        yield from ("-p", f"{own}{name}:={parameter_text(value)}")
-
-
-_NODE_PREFIX = re.compile(r"\w+:(?!//)", re.ASCII)
-
-
-def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -> str:
-    """Find `lib/<package>/<executable>` under the first prefix that has it, where types are found.
-
-    Raises:
-        PlanError: no prefix holds the package or the executable.
-    """
-    prefixes = search_prefixes(environment)
-    wanted = f"executable {run.executable!r} of package {run.package!r}"
-    found: set[str] = set()
-    for prefix in prefixes:
-        folder = prefix / "lib" / run.package
-        candidate = folder / run.executable
-        if os.path.isfile(candidate) and os.access(candidate, os.X_OK):
-            return str(candidate)
-        if os.path.isdir(folder):
-            found |= {each.name for each in folder.iterdir() if os.access(each, os.X_OK)}
-    if found:
-        raise PlanError(f"cannot find {wanted}: the package has {', '.join(sorted(found))}", at=at)
-    raise PlanError(
-        f"cannot find {wanted}: no lib/{run.package} with executables under "
-        f"{', '.join(map(str, prefixes))}",
-        hint="build and source its workspace, or correct the package name",
-        at=at,
+def _participant(
+    node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
+) -> PlannedParticipant:
+    sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
+    reason = f"connection {connection.name}, {connection.reason}"
+    return PlannedParticipant(
+        name=participant_name(node_name, connection.name),
+        dscp=next((each.dscp for each in replaced), None),
+        reason="; ".join([reason, *dict.fromkeys(each.reason for each in replaced)]),
+        max_datagram_bytes=min(sizes, default=None),
+        non_blocking_send=any(each.non_blocking_send for each in replaced),
+        connection=connection.name,
+        connections=ParticipantConnections(urls=connection.urls),
     )
-
-
-def parameter_text(value: ParameterValue) -> str:
-    """Write a parameter value as the YAML that rcl reads back as the same type.
-
-    Strings are always quoted: bare `1`, `true` or `1.0` would change type.
-    """
-    if isinstance(value, tuple):
-        return "[" + ", ".join(parameter_text(each) for each in value) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, float):
-        if math.isnan(value):
-            return ".nan"
-        if math.isinf(value):
-            return ".inf" if value > 0 else "-.inf"
-    return repr(value)

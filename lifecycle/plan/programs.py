@@ -24,7 +24,7 @@ from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.plan.model import PlanError
-from lifecycle.plan.participants import find_executable
+from lifecycle.plan.processes import find_executable
 from lifecycle.plan.python_source import (
     ClassKind,
     NodeClass,

@@ -18,9 +18,9 @@ from msgspec.structs import replace
 
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.network.ports import MAX_PORT
-from lifecycle.plan.connections.hosts import PortPool, contacts_of
+from lifecycle.plan.discovery import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
-from lifecycle.plan.negotiation.parties import hosts_of, terms_of
+from lifecycle.plan.parties import hosts_of, terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports

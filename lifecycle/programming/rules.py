@@ -34,8 +34,8 @@ from lifecycle.network.nfe import (
     socket_text,
 )
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.verify.network_flows import UNKNOWN
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.transport import UNKNOWN
 from lifecycle.verify.verdict import FlowReport
 
 PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}

@@ -17,14 +17,13 @@ from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.network_flows import Uniqueness, effective_transport
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
 from lifecycle.verify.rules.measured import NOT_MEASURED, OF_NUMBERS, measurements
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
-from lifecycle.verify.transport import effective_transport
-from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import (
     Finding,
     FlowReport,

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.verify.network_flows import Uniqueness
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
@@ -31,7 +32,6 @@ from lifecycle.verify.tool_filter import (
     part_type,
     tolerating_pattern,
 )
-from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     Actual,

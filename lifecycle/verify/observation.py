@@ -1,25 +1,30 @@
 """What was observed of a running system and what its nodes report: the input of `verify`.
 
-Owns: the observation types and the node configuration (schema:
-schemas/node_configuration.v1.schema.json), which nodes report and observers collect. Pure.
+Owns: the observation types; the node configuration (schema:
+schemas/node_configuration.v1.schema.json), which nodes report and observers collect; and `shown`,
+whether a node shows what others wait for. Pure.
 """
 
 from __future__ import annotations
 
 import hashlib
 import ipaddress
+from collections.abc import Iterable, Iterator
 from typing import Annotated
 
 import msgspec
 
 from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
-from lifecycle.manifest.model import EndpointKind, ParameterValue
+from lifecycle.manifest.checks.parameters import misfit
+from lifecycle.manifest.model import EndpointKind, ParameterValue, Readiness
+from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
-from lifecycle.plan.parameters import portable
+from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.parameters import as_type, portable
 from lifecycle.verify.outcome import ConnectionReport
 
 LONGEST_CONFIGURATION = 1 << 22
@@ -125,6 +130,12 @@ class ParameterReport(msgspec.Struct, frozen=True, kw_only=True):
             digest=digest,
             read_only=read_only,
         )
+
+    def has(self, value: ParameterValue) -> bool:
+        """Return whether it has a value of its type; what is not a number equals itself."""
+        if self.digest:
+            return self.digest == digest_of(value)
+        return self.value is not None and self.value == value
 
 
 def digest_of(value: ParameterValue) -> str:
@@ -311,3 +322,42 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
     measured: Measured | None = None
     clocks: tuple[tuple[str, ClockOffset], ...] | None = None
     marks: tuple[ArrivedMark, ...] = ()
+
+
+def shown(
+    awaited: Iterable[Readiness], node: PlannedNode, seen: Observation
+) -> frozenset[Readiness]:
+    """Return what of the awaited is there: discovery shows it, or the node itself reports it."""
+    wanted = tuple(awaited)
+    ends = {*_ends(node, seen)} if any(each.by.kinds for each in wanted) else set()
+    parameters = {each.name: each for each in _parameters(node, seen)}
+    return frozenset(
+        each
+        for each in wanted
+        if any((kind, topic_of(node, each.name, kind)) in ends for kind in each.by.kinds)
+        or (not each.by.kinds and _has(parameters.get(each.name), each))
+    )
+
+
+def _ends(node: PlannedNode, seen: Observation) -> Iterator[tuple[EndpointKind, str]]:
+    """Yield the endpoints of a node; of what it has on other participants only it knows."""
+    yield from ((each.kind, each.name) for each in seen.endpoints if each.node == node.full_name)
+    for report in seen.configurations:
+        if report.name == node.full_name:
+            yield from ((each.kind, each.resolved) for each in report.endpoints if each.mapped)
+
+
+def _parameters(node: PlannedNode, seen: Observation) -> Iterator[ParameterReport]:
+    for report in seen.configurations:
+        if report.name == node.full_name:
+            yield from report.parameters or ()
+    for read in seen.parameters:
+        if read.node == node.full_name:
+            yield from read.parameters or ()
+
+
+def _has(found: ParameterReport | None, wanted: Readiness) -> bool:
+    if found is None or wanted.value is None:
+        return False
+    value = as_type(wanted.value, found.type)
+    return not misfit(value, found.type) and found.has(portable(value))

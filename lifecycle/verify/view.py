@@ -25,6 +25,7 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
 )
+from lifecycle.verify.network_flows import Uniqueness
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
@@ -33,7 +34,6 @@ from lifecycle.verify.observation import (
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import DeclaredNames
-from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 
 _BY_STRENGTH = (

@@ -82,12 +82,12 @@ def main() -> None:
 
 def _say(nodes: list[Node], topic: str, index: int) -> None:
     from lifecycle.graph.reporter import STATUS_QOS
-    from lifecycle.middleware.services.supervisor_topics import _qos
+    from lifecycle.middleware.rcl.conversions import latched
     from tests.hostile.answers import MESSAGES
 
     node = Node("_ros2cli_teller", enable_rosout=False)
     nodes.append(node)
-    qos = STATUS_QOS if topic.endswith("graph") else _qos(64)
+    qos = STATUS_QOS if topic.endswith("graph") else latched(64)
     publisher = node.create_publisher(String, topic, qos)
     for _ in range(200):
         if publisher.get_subscription_count():

@@ -100,10 +100,10 @@ def test_those_that_choose_or_name_a_medium_know_it_and_all_others_ask_it() -> N
     assert knowing == {
         "network/medium.py",
         "network/nfe.py",  # shared memory is what shows no address
-        "verify/transport.py",
+        "verify/network_flows.py",
         "verify/view.py",
         "programming/rules.py",
         "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
-        "plan/negotiation/media.py",  # which medium two ends get
-        "plan/negotiation/connecting.py",
+        "plan/media.py",  # which medium two ends get
+        "plan/negotiate.py",
     }

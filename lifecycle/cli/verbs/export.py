@@ -156,7 +156,7 @@ _VARIABLES = {
 
 def _say_secret(word: str, engine: str) -> None:
     """Say that a word of the command line seems to be secret, and is written as it is."""
-    from lifecycle.plan.secrets import shown
+    from lifecycle.plan.processes import shown
 
     name, is_argument, value = word.partition(":=")
     if not is_argument:

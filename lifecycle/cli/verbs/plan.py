@@ -15,8 +15,8 @@ from lifecycle.cli.common import (
 )
 from lifecycle.errors import ExitCode
 from lifecycle.plan.model import Plan
+from lifecycle.plan.processes import without_secrets
 from lifecycle.plan.render import render_text
-from lifecycle.plan.secrets import without_secrets
 
 
 @click.command("plan")

@@ -18,7 +18,7 @@ from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
 from lifecycle.plan.build import build_plan, find_node
-from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan, PlannedNode
 
 _ROS_ARGUMENTS = "--ros-args"

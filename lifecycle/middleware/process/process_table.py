@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.middleware.process.prefixes import is_of_process
-from lifecycle.plan.secrets import shown
+from lifecycle.plan.processes import shown
 
 _LONGEST_VALUE = 8192
 

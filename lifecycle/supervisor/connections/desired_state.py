@@ -15,7 +15,7 @@ from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules.run import NOT_WIRED, node_of
+from lifecycle.verify.rules.catalogue import NOT_WIRED, node_of
 from lifecycle.verify.verdict import Finding
 
 

@@ -26,7 +26,7 @@ from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify.rules import Rule
-from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
+from lifecycle.verify.rules.catalogue import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:

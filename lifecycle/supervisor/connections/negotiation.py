@@ -20,9 +20,7 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
-from lifecycle.plan.connections.control import participant_name
-from lifecycle.plan.connections.hosts import contacts_of, ports_of
-from lifecycle.plan.connections.wiring import with_graph
+from lifecycle.plan.discovery import contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -31,8 +29,9 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import (
+from lifecycle.plan.negotiate import negotiate
+from lifecycle.plan.participants import participant_name
+from lifecycle.plan.parties import (
     DataLayerGraph,
     NegotiatedConnection,
     Party,
@@ -42,6 +41,7 @@ from lifecycle.plan.negotiation.parties import (
     transports_of,
     wishes_of,
 )
+from lifecycle.plan.wiring import with_graph
 from lifecycle.supervisor.connections.desired_state import (
     Instructions,
     not_wired,
@@ -65,7 +65,7 @@ def party_of(
 
     Args:
         configuration: as the node reports it.
-        host: its host, see `lifecycle.plan.connections.hosts`.
+        host: its host, see `lifecycle.plan.discovery`.
         planned: the node as the manifest declares it; None if it does not.
         negotiated: names of connections that a negotiation made before: it may unmake them. Others
             are not its own, and what is mapped onto them stays there.

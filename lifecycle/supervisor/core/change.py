@@ -12,8 +12,7 @@ from msgspec.structs import asdict, replace
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import TargetState
 from lifecycle.plan.build import attached_to
-from lifecycle.plan.change import PlanChange, change_between
-from lifecycle.plan.comparison import difference_lines
+from lifecycle.plan.comparison import PlanChange, change_between, difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as

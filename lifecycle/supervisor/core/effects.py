@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from lifecycle.errors import ExitCode
-from lifecycle.plan.change import GivenParameters
+from lifecycle.plan.comparison import GivenParameters
 from lifecycle.supervisor.core.state import Step
 from lifecycle.verify.verdict import Verdict
 

@@ -41,7 +41,7 @@ from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import missing, not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import Rule, rule
-from lifecycle.verify.rules.run import DEADLINE, GAVE_UP, PROCESS_DIED, START_FAILED
+from lifecycle.verify.rules.catalogue import DEADLINE, GAVE_UP, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Verdict
 
 ALSO_S = 0.5

@@ -12,7 +12,7 @@ from lifecycle.supervisor.core.inputs import Programmed
 from lifecycle.supervisor.core.state import Level, Passage, Run
 from lifecycle.supervisor.run.events import Event, Failure, GateOpened, Notice, SystemReached
 from lifecycle.verify.judge import not_ok, taken_on_trust
-from lifecycle.verify.rules.run import NOT_PROGRAMMED, TRANSITION_FAILED
+from lifecycle.verify.rules.catalogue import NOT_PROGRAMMED, TRANSITION_FAILED
 from lifecycle.verify.verdict import Verdict
 
 CLOSED = "the verdict keeps the gate closed"

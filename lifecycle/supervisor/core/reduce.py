@@ -36,7 +36,7 @@ from lifecycle.supervisor.core.state import (
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
 from lifecycle.supervisor.run.options import Until
-from lifecycle.verify.rules.run import NOT_WIRED, START_FAILED, TRANSITION_FAILED
+from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
 
 _UPWARDS = (*UP.values(), Step.WIRE)
 _PASSES = 3

@@ -26,7 +26,7 @@ from lifecycle.manifest.model import (
     Supervision,
     TargetState,
 )
-from lifecycle.plan.change import GivenParameters, PlanChange
+from lifecycle.plan.comparison import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited

@@ -27,8 +27,8 @@ from lifecycle.supervisor.run.events import Failure, Notice
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.catalogue import START_FAILED
 from lifecycle.verify.rules.nodes import DUPLICATE_NODE
-from lifecycle.verify.rules.run import START_FAILED
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:

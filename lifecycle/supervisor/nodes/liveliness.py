@@ -33,7 +33,7 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules.run import NOT_ANSWERING, SILENT_NODE
+from lifecycle.verify.rules.catalogue import NOT_ANSWERING, SILENT_NODE
 from lifecycle.verify.tool_filter import is_hidden_node, tolerating_pattern
 from lifecycle.verify.verdict import Finding, Verdict
 

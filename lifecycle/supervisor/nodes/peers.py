@@ -39,9 +39,9 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.verify.observation import ArrivedMark, Observation
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.catalogue import PLAN_UNKNOWN, PLANS_DIFFER
 from lifecycle.verify.rules.measured import compares_clocks
 from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
 from lifecycle.verify.verdict import Finding, FlowReport, Verdict
 
 if TYPE_CHECKING:

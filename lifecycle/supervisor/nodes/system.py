@@ -38,7 +38,7 @@ from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import HealthReport, NodeConfiguration
-from lifecycle.verify.rules.health import health_of
+from lifecycle.verify.rules.state import health_of
 
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph

@@ -17,7 +17,7 @@ from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
-from lifecycle.verify.rules.run import GAVE_UP, PROCESS_DIED, node_of
+from lifecycle.verify.rules.catalogue import GAVE_UP, PROCESS_DIED, node_of
 from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
 
 if TYPE_CHECKING:

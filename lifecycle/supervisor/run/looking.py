@@ -28,7 +28,7 @@ from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import check_memory
 from lifecycle.middleware.process.process_table import note_ended
-from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import expected_by_onlooker, is_negotiated

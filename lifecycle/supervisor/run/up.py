@@ -43,7 +43,7 @@ from lifecycle.middleware.process.control import (
 from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.middleware.rcl.conversions import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
-from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (

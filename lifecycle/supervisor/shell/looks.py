@@ -29,14 +29,13 @@ from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.shell.grace_period import GracePeriod
 from lifecycle.supervisor.shell.standstill import Standstill
 from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
-from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
+from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation, shown
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.readiness import shown
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
-from lifecycle.verify.rules.health import UNHEALTHY, health_of
 from lifecycle.verify.rules.matching import UNKNOWN_PEER
 from lifecycle.verify.rules.measured import decided_by_clocks
+from lifecycle.verify.rules.state import UNHEALTHY, health_of
 from lifecycle.verify.verdict import FindingKey, Stage, Verdict
 
 if TYPE_CHECKING:

@@ -57,7 +57,7 @@ from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
 from lifecycle.verify.judge import with_findings
-from lifecycle.verify.rules.run import PROCESS_DIED
+from lifecycle.verify.rules.catalogue import PROCESS_DIED
 from lifecycle.verify.verdict import NOT_JUDGED, Verdict
 
 if TYPE_CHECKING:

@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from lifecycle.verify.rules import (
-    connections,
-    declaration,
     endpoints,
     flows,
-    health,
     matching,
     measured,
     nodes,
     parameters,
     qos,
-    run,
     state,
-    time,
 )
-from lifecycle.verify.rules.catalogue import About, Heals, Rule
+from lifecycle.verify.rules.catalogue import RUN_RULES, About, Heals, Rule
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import View
 
@@ -32,17 +27,12 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (qos.RULES, qos.check),
     (matching.RULES, matching.check),
     (state.RULES, state.check),
-    (health.RULES, health.check),
-    (state.REPORT_RULES, state.check_reports),
     (parameters.RULES, parameters.check),
-    (declaration.RULES, declaration.check),
-    (time.RULES, time.check),
-    (connections.RULES, connections.check),
     (flows.RULES, flows.check),
     (measured.RULES, measured.check),
 )
 
-RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *run.RULES)
+RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *RUN_RULES)
 """Every rule, in the order in which findings are reported."""
 
 CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(check for _, check in _FAMILIES)

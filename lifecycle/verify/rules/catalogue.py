@@ -1,7 +1,8 @@
 """What a verification rule is: its id, outcomes, fix, and when its findings clear.
 
-Owns: `Rule`, which makes the findings that carry its id. Code that acts on findings asks their
-rules and does not parse ids, subjects or messages. Pure.
+Owns: `Rule`, which makes the findings that carry its id, and the rules about the run itself, which
+no check of an observation finds: the supervisor puts those findings into the run's last verdict.
+Code that acts on findings asks their rules and does not parse ids, subjects or messages. Pure.
 """
 
 from __future__ import annotations
@@ -144,3 +145,89 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
             return found(subject=what.full_name, node=what.full_name)
         planned = what.planned
         return found(subject=planned.resolved, node=what.node.full_name, endpoint=planned.kind)
+
+
+PROCESS_DIED = Rule(
+    id="run.process-died",
+    meaning="a process of the system ended although nobody asked it to, or died when asked to",
+    fix="look at the last lines of its log",
+    names_log=True,
+)
+GAVE_UP = Rule(
+    id="run.gave-up",
+    meaning="a process failed too often to be started again",
+    fix="see what it failed of each time, in the message and in its log",
+    names_log=True,
+)
+START_FAILED = Rule(
+    id="run.start-failed",
+    meaning="a process or node could not be started",
+    fix="look at its `run` entry and at the last lines of its log",
+    names_log=True,
+)
+TRANSITION_FAILED = Rule(
+    id="run.transition-failed",
+    meaning="a node refused or failed a transition",
+    fix="look at the reason, and at the traceback in the node's log",
+    names_log=True,
+)
+DEADLINE = Rule(
+    id="run.deadline",
+    meaning="a step, or the whole bring-up, took longer than it may",
+    fix="see what it waited for; raise the node's `timeouts` or `--timeout` if it needs longer",
+)
+NOT_PROGRAMMED = Rule(
+    id="run.not-programmed",
+    meaning="a network could not be programmed with the verified flows",
+    fix="see which privilege, program or server is missing; `flows apply --dry-run` tries it alone",
+)
+NOT_WIRED = Rule(
+    id="run.not-wired",
+    meaning="a connection or a mapping could not be made, or made again",
+    fix="the message names node, connection, endpoint and the node's own reason",
+)
+SILENT_NODE = Rule(
+    id="run.silent-node",
+    meaning="a node was stopped, hangs in a callback, or cannot be reached any more",
+    fix="the message says which; a callback that may take long needs a larger `timeouts.silent_s`",
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
+)
+NOT_ANSWERING = Rule(
+    id="run.not-answering",
+    meaning="a node that is in no host of ours answers no request",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="look at what its callbacks wait for, and whether its process was stopped",
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
+)
+PLANS_DIFFER = Rule(
+    id="run.plans-differ",
+    meaning="the supervisor of another machine planned another system than this one",
+    fix="give both supervisors the same manifest and arguments, and start them again",
+)
+PLAN_UNKNOWN = Rule(
+    id="run.plan-unknown",
+    meaning="the supervisor of another machine does not say what it planned",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="run the same version of lifecycle on every machine of the system",
+    heals=Heals.WITH_TIME,
+)
+RUN_RULES = (
+    PROCESS_DIED,
+    GAVE_UP,
+    START_FAILED,
+    TRANSITION_FAILED,
+    DEADLINE,
+    NOT_PROGRAMMED,
+    NOT_WIRED,
+    SILENT_NODE,
+    NOT_ANSWERING,
+    PLANS_DIFFER,
+    PLAN_UNKNOWN,
+)
+
+
+def node_of(subject: str) -> str:
+    """Return the node that a subject of these rules names; empty for a process or a system."""
+    return subject if subject.startswith("/") else ""

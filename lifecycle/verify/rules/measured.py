@@ -1,7 +1,7 @@
 """Rules about data as they arrive: delay, rate, loss and silence of flows. Pure.
 
 Judged is what a subscription has counted, in nodes of ours, once that can decide the declared
-number (`lifecycle.measure.bounds`). Until then a bound is "measuring": it is neither ok nor
+number (`lifecycle.measure.flows`). Until then a bound is "measuring": it is neither ok nor
 violated. What nothing counts is unverifiable by name, from the first gate on.
 
 A 5QI stands for its packet delay budget, which 98 % of the packets keep, and its packet error rate
@@ -17,9 +17,18 @@ from collections.abc import Iterable, Iterator, Sequence
 import msgspec
 
 from lifecycle.manifest.model import EndpointKind, Executor, Quantity, TargetState
-from lifecycle.measure.bounds import Bound, Judgement, Kind, apart, judge, ms
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
-from lifecycle.measure.flows import FlowMeasurement, MeasuredBound, Pair
+from lifecycle.measure.flows import (
+    Bound,
+    FlowMeasurement,
+    Judgement,
+    Kind,
+    MeasuredBound,
+    Pair,
+    apart,
+    judge,
+    ms,
+)
 from lifecycle.measure.sample import DELAY_S, Sample
 from lifecycle.network.dscp import describe
 from lifecycle.network.five_qi import five_qi_of

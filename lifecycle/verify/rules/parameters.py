@@ -1,4 +1,7 @@
-"""Rules about nodes' parameters: those that are declared and those that are given. Pure."""
+"""Rules about nodes' parameters, about warnings of the manifest, and about simulated time. Pure.
+
+Of what `lifecycle check` warns only that is repeated here which no observation can settle.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from lifecycle.manifest.checks.parameters import is_implicit
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import ParameterValue
-from lifecycle.plan.model import ExpectedParameter, PlannedNode
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import SIM_TIME, EndpointKind, ParameterValue
+from lifecycle.plan.model import ExpectedParameter, PlannedNode, uses_sim_time
 from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
-from lifecycle.verify.observation import SERVES_NONE, ParameterReport, digest_of
+from lifecycle.verify.observation import SERVES_NONE, ObservedEndpoint, ParameterReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.tool_filter import CLOCK
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import NodeFacts, View
 
 MISSING = Rule(
@@ -55,26 +59,18 @@ REACHED_NONE = Rule(
     fix="correct the name of the node or of the parameter, or remove the value",
     heals=Heals.WITH_TIME,
 )
-RULES = (
-    MISSING,
-    UNDECLARED,
-    TYPE_DIFFERS,
-    VALUE_DIFFERS,
-    READ_ONLY_DIFFERS,
-    UNVERIFIABLE,
-    REACHED_NONE,
-)
-
 _NAMED = 8
 _SHOWN_ITEMS = 8
 _SHOWN_TEXT = 60
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge the parameters of every node that is there."""
+    """Judge the parameters of every node, repeat warnings, judge where simulated time is from."""
     for facts in view.nodes.values():
         yield from _judge_node(facts)
     yield from _reached_none(view)
+    yield from _warnings(view)
+    yield from _time(view)
 
 
 def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -161,7 +157,7 @@ def _judge(
             message=f"{what} is {_with_type(actual)}, and must be "
             f"{expected.type} as {_origin(expected)}",
         )
-    elif expected.value is not None and not is_value(actual, expected.value):
+    elif expected.value is not None and not actual.has(expected.value):
         wanted = spell(expected.value, expected.type)
         hint = ""
         if expected.source == DEFAULT:
@@ -255,13 +251,6 @@ def _is_of_type(actual: ParameterReport, type_: str) -> bool:
     return actual.type == type_
 
 
-def is_value(actual: ParameterReport, value: ParameterValue) -> bool:
-    """Compare values of one type; what is not a number equals itself, and 0.0 equals -0.0."""
-    if actual.digest:
-        return actual.digest == digest_of(value)
-    return actual.value is not None and actual.value == value
-
-
 def _with_type(actual: ParameterReport) -> str:
     if not actual.type:
         return "not set"
@@ -289,3 +278,168 @@ def spell(value: ParameterValue, type_: str) -> str:
     if len(spelled) > _SHOWN_TEXT:
         return f"{spelled[: _SHOWN_TEXT - 2]}…{spelled[-1]}"
     return spelled
+
+
+UNPROVEN = Rule(
+    id="declaration.unproven",
+    meaning="`lifecycle check` warns of something that is declared and that nothing can prove",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="see what `lifecycle check` says of it",
+)
+
+
+_NO_NODE = frozenset(
+    (
+        "check.parameter-file-unmatched",
+        "check.parameter-undeclared",
+        "check.parameter-for-no-node",
+    )
+)
+_JUDGED = frozenset(
+    (
+        *("check.qos-doubtful", "check.type-not-installed", "check.parameter-empty-array"),
+        *("check.flow-foreign", "check.flow-transport", "check.ipv6-transports"),
+        "yaml.tag",
+    )
+)
+"""Rules of `check` whose matter is judged where the system runs, by the rule that is about it."""
+
+
+def _warnings(view: View) -> Iterator[Finding]:
+    """Repeat the warnings that stay true whatever is seen."""
+    for each in view.plan.unproven:
+        if each.rule not in _JUDGED:
+            yield _of_warning(each)
+
+
+def _of_warning(warning: Diagnostic) -> Finding:
+    rule = REACHED_NONE if warning.rule in _NO_NODE else UNPROVEN
+    return rule.finding(
+        subject=warning.at.path or warning.at.file,
+        expected="no warning",
+        observed=warning.rule,
+        message=warning.message,
+        at=warning.at,
+        hint=warning.hint,
+    )
+
+
+NO_CLOCK = Rule(
+    id="time.no-clock",
+    meaning="nodes use simulated time, and nobody publishes /clock",
+    fix="start the simulator or the bag (`ros2 bag play --clock`), or set use_sim_time: false",
+    heals=Heals.WITH_TIME,
+    absence="publisher of simulated time",
+)
+SEVERAL_CLOCKS = Rule(
+    id="time.several-clocks",
+    meaning="nodes use simulated time, and /clock has more than one publisher",
+    fix="stop all but one: each makes time jump to its own",
+)
+UNDECLARED_CLOCK = Rule(
+    id="time.undeclared-clock",
+    meaning="nodes use simulated time, and who publishes /clock is not declared to",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="declare the publisher of /clock, rosgraph_msgs/msg/Clock, in the node that has it",
+)
+SILENT_CLOCK = Rule(
+    id="time.silent-clock",
+    meaning="nodes use simulated time, and the publisher of /clock has not sent any yet",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="see whether the simulator runs, or is paused before its first step",
+    heals=Heals.WITH_TIME,
+)
+RULES = (
+    *(MISSING, UNDECLARED, TYPE_DIFFERS, VALUE_DIFFERS, READ_ONLY_DIFFERS),
+    *(UNVERIFIABLE, REACHED_NONE),
+    UNPROVEN,
+    *(NO_CLOCK, SEVERAL_CLOCKS, UNDECLARED_CLOCK, SILENT_CLOCK),
+)
+
+
+def _time(view: View) -> Iterator[Finding]:
+    """Judge where the time of nodes with `use_sim_time` comes from."""
+    users = [node for node in view.plan.nodes if _uses(view, node)]
+    if not users:
+        return
+    topic, type_ = CLOCK
+    publishers = [
+        each
+        for group in view.groups.values()
+        for each in group
+        if (each.kind, each.name, each.type) == (EndpointKind.PUBLISHER, topic, type_)
+    ]
+    if len(publishers) > 1:
+        owners = ", ".join(sorted(each.node or "an unknown node" for each in publishers))
+        yield SEVERAL_CLOCKS.finding(
+            **_place(users),
+            expected="one publisher",
+            observed=f"{len(publishers)} publishers",
+            message=f"several nodes give {_named(users)} their time: {owners} publish {topic}",
+        )
+    elif not publishers:
+        # Of a declared one that is missing, or cannot be seen from here, there is a finding.
+        if not any(_publishes(node) for node in view.plan.nodes):
+            yield NO_CLOCK.finding(
+                **_place(users),
+                expected=f"publisher of {type_}",
+                observed="no publisher",
+                message=f"there is no simulated time for {_named(users)}:"
+                f" nothing publishes {topic}",
+            )
+    else:
+        yield from _of_one(view, users, publishers[0])
+
+
+def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -> Iterator[Finding]:
+    who = publisher.node or "an unknown node"
+    if (publisher.node, publisher.kind, publisher.name) not in view.names.ends:
+        yield UNDECLARED_CLOCK.finding(
+            **_place(users),
+            expected="declared publisher",
+            observed=f"publisher of {who}",
+            message=f"{who} gives {_named(users)} their time on {publisher.name},"
+            " and the manifest does not declare it",
+        )
+    # A managed publisher sends once it is active.
+    if publisher.silent and view.stage is Stage.ACTIVE:
+        yield SILENT_CLOCK.finding(
+            **_place(users),
+            expected="time",
+            observed="no message",
+            message=f"there is no time yet for {_named(users)}:"
+            f" {who} has not sent any on {publisher.name}",
+        )
+
+
+def _uses(view: View, node: PlannedNode) -> bool:
+    configuration = view.configurations.get(node.full_name)
+    reported = (configuration.parameters if configuration is not None else None) or ()
+    return uses_sim_time(node) or any(
+        each.name == SIM_TIME and each.value is True for each in reported
+    )
+
+
+def _publishes(node: PlannedNode) -> bool:
+    return any(
+        (each.kind, each.resolved, each.type) == (EndpointKind.PUBLISHER, *CLOCK)
+        for each in node.endpoints
+    )
+
+
+def _named(users: list[PlannedNode]) -> str:
+    names = [each.full_name for each in users]
+    more = f" and {len(names) - _NAMED_USERS} more" if len(names) > _NAMED_USERS else ""
+    return ", ".join(names[:_NAMED_USERS]) + more
+
+
+_NAMED_USERS = 4
+
+
+def _place(users: list[PlannedNode]) -> dict[str, Any]:
+    """Return what findings are about, and where the first of the nodes is given its time."""
+    given = next(
+        (each.at for node in users for each in node.expected_parameters if each.name == SIM_TIME),
+        users[0].at,
+    )
+    return {"subject": CLOCK[0], "at": given, "endpoint": EndpointKind.PUBLISHER}

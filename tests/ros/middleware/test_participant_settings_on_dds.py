@@ -26,8 +26,8 @@ from lifecycle.middleware.fastdds.nfe import (
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.network.nfe import NetworkFlowEndpoint
+from lifecycle.verify.network_flows import carrier
 from lifecycle.verify.observation import Identity
-from lifecycle.verify.transport import carrier
 
 HERE = Path(__file__).parent
 QOS = QosProfile()

@@ -14,8 +14,7 @@ from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.cli.verbs.flows import watched_flows
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
-from lifecycle.measure.bounds import Kind
-from lifecycle.measure.flows import FlowMeasurement, MeasuredBound, measured_summary
+from lifecycle.measure.flows import FlowMeasurement, Kind, MeasuredBound, measured_summary
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport

@@ -10,11 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.measure.bounds import CLOCKS_S, Bound, Judgement, Kind, judge
 from lifecycle.measure.clock import JUDGED_S, SAME_CLOCK, ClockComparison, ClockOffset
 from lifecycle.measure.counter import WARM_UP_S, Counter
-from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, least_ns, signed_buckets_of
-from lifecycle.measure.sample import Sample
+from lifecycle.measure.flows import CLOCKS_S, Bound, Judgement, Kind, judge
+from lifecycle.measure.sample import (
+    ERROR,
+    LAST_BUCKET,
+    LONGEST_NS,
+    Sample,
+    least_ns,
+    signed_buckets_of,
+)
 
 NS = 10**9
 START = 1_700_000_000 * NS

@@ -11,10 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from lifecycle.measure.bounds import Bound, Judgement, Kind, judge, ms, percentile, too_many
 from lifecycle.measure.counter import WARM_UP_S, Counter
-from lifecycle.measure.delays import ERROR, LAST_BUCKET, LONGEST_NS, Delays, buckets_of, least_ns
-from lifecycle.measure.sample import DELAY_S, SLOT_S, Measured, Sample, Slot
+from lifecycle.measure.flows import Bound, Judgement, Kind, judge, ms, percentile, too_many
+from lifecycle.measure.sample import (
+    DELAY_S,
+    ERROR,
+    LAST_BUCKET,
+    LONGEST_NS,
+    SLOT_S,
+    Delays,
+    Measured,
+    Sample,
+    Slot,
+    buckets_of,
+    least_ns,
+)
 
 NS = 10**9
 WALL = 1_700_000_000 * NS

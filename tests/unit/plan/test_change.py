@@ -26,7 +26,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.change import GivenParameters, PlanChange, change_between
+from lifecycle.plan.comparison import GivenParameters, PlanChange, change_between
 from tests.builders import (
     at,
     link,

@@ -19,7 +19,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan, PlanError
-from lifecycle.plan.negotiation.parties import terms_of
+from lifecycle.plan.parties import terms_of
 from tests.builders import at, link, manifest, node, planned, publisher, subscription
 
 TWO = (

@@ -13,10 +13,10 @@ from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.connections.hosts import Contact
+from lifecycle.plan.discovery import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedParticipant
-from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import DataLayerGraph, Party, Terms, transports_of
+from lifecycle.plan.negotiate import negotiate
+from lifecycle.plan.parties import DataLayerGraph, Party, Terms, transports_of
 from tests.builders import at
 
 STRING = "std_msgs/msg/String"

@@ -13,7 +13,7 @@ from lifecycle.manifest.loading import load
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.comparison import changes, plan_checksum
 from lifecycle.plan.model import Plan
-from lifecycle.plan.secrets import shown, without_secrets
+from lifecycle.plan.processes import shown, without_secrets
 
 
 def differences(old: Plan, new: Plan) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import dependency_levels, planned_processes
-from lifecycle.plan.participants import command_line, parameter_text
+from lifecycle.plan.processes import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

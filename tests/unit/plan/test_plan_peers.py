@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import Discovery, DiscoveryMode, DiscoveryRange, Machine
 from lifecycle.middleware.fastdds.discovery import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_profile
-from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan
 from tests.builders import HERE, plan_of, planned_node
 

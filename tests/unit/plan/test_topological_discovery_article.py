@@ -29,8 +29,8 @@ from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import (
+from lifecycle.plan.negotiate import negotiate
+from lifecycle.plan.parties import (
     DataLayerGraph,
     hosts_of,
     party_of_node,

@@ -11,14 +11,14 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.connections.hosts import Contact
+from lifecycle.plan.discovery import Contact
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedEndpoint,
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.plan.negotiation.parties import Party
+from lifecycle.plan.parties import Party
 from lifecycle.supervisor.connections.negotiation import party_of
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport

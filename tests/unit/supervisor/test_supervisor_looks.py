@@ -13,8 +13,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import Health, Machine, Quantity
 from lifecycle.measure.clock import ClockOffset
-from lifecycle.measure.delays import Delays
-from lifecycle.measure.sample import Measured, Sample
+from lifecycle.measure.sample import Delays, Measured, Sample
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.peers import Peers
 from lifecycle.supervisor.shell.grace_period import PASSING_S

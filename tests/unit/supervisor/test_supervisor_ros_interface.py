@@ -14,8 +14,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
-from lifecycle.measure.bounds import Kind
-from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
+from lifecycle.measure.flows import FlowMeasurement, Kind, MeasuredBound
 from lifecycle.supervisor.control.ros_interface import (
     BRINGS_UP_S,
     ERROR,

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Machine, Policy, Quantity
-from lifecycle.measure.bounds import CLOCKS_S
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.measure.counter import Counter
-from lifecycle.measure.delays import Delays, signed_buckets_of
-from lifecycle.measure.sample import Measured, Sample
+from lifecycle.measure.flows import CLOCKS_S
+from lifecycle.measure.sample import Delays, Measured, Sample, signed_buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import apart_from_numbers, verify, with_measured
 from lifecycle.verify.observation import Identity

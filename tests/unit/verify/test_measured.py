@@ -6,8 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Executor, Machine, Quantity, Run, RunKind
-from lifecycle.measure.delays import Delays, buckets_of
-from lifecycle.measure.sample import Measured, Sample, Slot
+from lifecycle.measure.sample import Delays, Measured, Sample, Slot, buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import without_measured
 from lifecycle.verify.observation import Observation

@@ -11,8 +11,8 @@ from lifecycle.verify.observation import (
     Observation,
     ObservedEndpoint,
     ParameterReport,
+    shown,
 )
-from lifecycle.verify.readiness import shown
 from tests.builders import configuration, planned_node, reported
 
 PUBLISHER, SUBSCRIPTION, SERVER, CLIENT, ACTION, _ = EndpointKind

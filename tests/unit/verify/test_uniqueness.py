@@ -13,8 +13,8 @@ from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, dissimilar, is_ip, located
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.network_flows import Uniqueness, meets
 from lifecycle.verify.observation import Identity
-from lifecycle.verify.uniqueness import Uniqueness, meets
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual
 from tests import builders

@@ -11,7 +11,7 @@ from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import EndpointReport, HealthReport, Observation
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules.run import node_of
+from lifecycle.verify.rules.catalogue import node_of
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import (
     IMAGE,

@@ -13,9 +13,9 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
+from lifecycle.verify.network_flows import carrier
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import ConnectionReport
-from lifecycle.verify.transport import carrier
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, both, change_configuration, change_report

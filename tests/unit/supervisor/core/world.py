@@ -31,8 +31,7 @@ from lifecycle.manifest.model import (
     Supervision,
     TargetState,
 )
-from lifecycle.measure.bounds import Kind
-from lifecycle.measure.flows import FlowMeasurement, MeasuredBound
+from lifecycle.measure.flows import FlowMeasurement, Kind, MeasuredBound
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.run.options import Until, UpOptions

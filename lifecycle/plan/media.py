@@ -27,7 +27,7 @@ import msgspec
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.medium import CONNECTABLE, Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.model import PlannedEndpoint
-from lifecycle.plan.negotiation.parties import End, NegotiatedFlow, Party
+from lifecycle.plan.parties import End, NegotiatedFlow, Party
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True):

@@ -31,15 +31,16 @@ from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import TRANSPORTS_VARIABLE, medium_of, udp_to
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.connections.control import (
+from lifecycle.plan.discovery import (
+    Hosts,
+    PortPool,
     connect_control,
     connect_observers,
     is_fixed,
     meshed,
-    participant_name,
     with_tcp,
 )
-from lifecycle.plan.connections.hosts import Hosts, PortPool
+from lifecycle.plan.media import carried
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
@@ -55,15 +56,14 @@ from lifecycle.plan.model import (
     StaticEndpoint,
     StaticParticipant,
 )
-from lifecycle.plan.negotiation.media import carried
-from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import (
+from lifecycle.plan.negotiate import negotiate
+from lifecycle.plan.participants import participant_name, place_negotiated
+from lifecycle.plan.parties import (
     DataLayerGraph,
     NegotiatedConnection,
     NegotiatedFlow,
     Party,
     party_of_node,
-    place_negotiated,
     rmw_of,
     terms_of,
     wishes_of,

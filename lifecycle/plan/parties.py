@@ -1,18 +1,15 @@
 """The parties of a negotiation, the terms of their system, and the data layer graph that results.
 
-Owns: `Party`, `Terms`, `DataLayerGraph`; `party_of_node` and `terms_of`, which make them of a plan;
-`place_negotiated`, which gives a planned node what was negotiated for it. Negotiation is used
-before anything runs, and while it does. The rules are in `media`, and `negotiate` applies them.
-Pure.
+Negotiation is used before anything runs, and while it does: `party_of_node` and `terms_of` make
+them of a plan. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     DiscoveryMode,
@@ -32,10 +29,8 @@ from lifecycle.network.medium import (
     Medium,
 )
 from lifecycle.network.ports import DG, domain_base
-from lifecycle.plan.connections.control import is_fixed, participant_name
-from lifecycle.plan.connections.hosts import Contact, Hosts, contacts_of, ports_of
+from lifecycle.plan.discovery import Contact, Hosts, contacts_of, is_fixed, ports_of
 from lifecycle.plan.model import (
-    ParticipantConnections,
     Plan,
     PlannedEndpoint,
     PlannedFlow,
@@ -52,7 +47,7 @@ class Party(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         key: manifest key; the full name of a node that no manifest declares.
-        host: its host, see `lifecycle.plan.connections.hosts`; parties of equal hosts share memory.
+        host: its host, see `lifecycle.plan.discovery`; parties of equal hosts share memory.
         process: unique on the host.
         transports: all that it can be connected by.
         own: transports of its own participant; empty if not known.
@@ -223,47 +218,6 @@ def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, 
         environment = {**variables, **environment}
     word = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0]
     return BUILTIN_TRANSPORTS.get(word or "DEFAULT", ())
-
-
-def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:
-    """Give a node the connections that were negotiated for it.
-
-    An extra participant that made a publisher's flow unique and carries none any more is removed;
-    the publisher's connection takes its purpose.
-    """
-    places = {label: each for each in connections for label in each.map}
-    endpoints = []
-    carriers = {each.name: each for each in node.participants}
-    takes: dict[str, list[PlannedParticipant]] = {}
-    for each in node.endpoints:
-        connection = places.get(each.kind.spell(each.name))
-        if connection is None:
-            endpoints.append(each)
-            continue
-        if each.participant in carriers:
-            takes.setdefault(connection.name, []).append(carriers[each.participant])
-        name = participant_name(node.name, connection.name)
-        endpoints.append(replace(each, participant=name))
-    used = {each.participant for each in endpoints}
-    kept = [each for each in node.participants if each.connection or each.name in used]
-    made = [_participant(node.name, each, takes.get(each.name, ())) for each in connections]
-    return replace(node, endpoints=tuple(endpoints), participants=(*kept, *made))
-
-
-def _participant(
-    node_name: str, connection: NegotiatedConnection, replaced: Sequence[PlannedParticipant]
-) -> PlannedParticipant:
-    sizes = [each.max_datagram_bytes for each in replaced if each.max_datagram_bytes is not None]
-    reason = f"connection {connection.name}, {connection.reason}"
-    return PlannedParticipant(
-        name=participant_name(node_name, connection.name),
-        dscp=next((each.dscp for each in replaced), None),
-        reason="; ".join([reason, *dict.fromkeys(each.reason for each in replaced)]),
-        max_datagram_bytes=min(sizes, default=None),
-        non_blocking_send=any(each.non_blocking_send for each in replaced),
-        connection=connection.name,
-        connections=ParticipantConnections(urls=connection.urls),
-    )
 
 
 def hosts_of(plan: Plan) -> Hosts:

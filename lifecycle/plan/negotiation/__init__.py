@@ -1,1 +1,0 @@
-"""From parties, wishes and terms to the data layer graph."""
