@@ -14,14 +14,14 @@ from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.lifecycle.steps import Running, called, error_text
+from lifecycle.node.callbacks import Running, called, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
     from lifecycle.middleware.services.actions import GoalServer
-    from lifecycle.node.endpoints.endpoint import Endpoint
-    from lifecycle.node.lifecycle.gate import NodeGate
+    from lifecycle.node.endpoint import Endpoint
+    from lifecycle.node.gate import NodeGate
 
 
 class GoalInterruptedError(LifecycleError):

@@ -39,9 +39,8 @@ from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.node.author import parameters
-from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.endpoint import (
+from lifecycle.node.connections import Connection, Connections
+from lifecycle.node.endpoint import (
     CLIENTS,
     Endpoint,
     Placement,
@@ -49,6 +48,7 @@ from lifecycle.node.endpoints.endpoint import (
     interface_name,
     wire_name,
 )
+from lifecycle.node.planned import parameter_reports
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.manifest.diagnostics import Position
+    from lifecycle.node.gate import Later
     from lifecycle.node.host.adoption import Hosted
-    from lifecycle.node.lifecycle.gate import Later
 
 PARADIGMS = ("publish-subscribe", "request-response")
 """Topics; services, and actions, which consist of both."""
@@ -196,7 +196,7 @@ def collect(
         paradigms=PARADIGMS,
         endpoints=reports,
         connections=connection_reports(hosted.spec, hosted.connections, reports),
-        parameters=parameters.reports(node),
+        parameters=parameter_reports(node),
         health=health,
         measured=hosted.gate.measured(),
     )

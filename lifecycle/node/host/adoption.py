@@ -23,11 +23,10 @@ from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.rcl.graph_queries import OVER_DDS
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
-from lifecycle.node.author import parameters
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, load_nodes
 from lifecycle.node.host.foreign import ForeignNode
+from lifecycle.node.managed import Managed
+from lifecycle.node.node import LifecycleNode
+from lifecycle.node.planned import Construction, load_nodes, planned_options
 from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
@@ -204,7 +203,7 @@ class Adoption:
             yield name, options
             return
         refuse_unmanaged(planned, type(node))
-        options = parameters.planned_options(node, planned, options)
+        options = planned_options(node, planned, options)
         options["namespace"] = planned.namespace
         options["use_global_arguments"] = self._use_global_arguments
         if ours:

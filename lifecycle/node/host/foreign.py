@@ -36,18 +36,18 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
-from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.node_interface import serve_interface
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
-from lifecycle.node.lifecycle.machine import RefusedError
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
+from lifecycle.node.connections import Connection, Connections
+from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
+from lifecycle.node.gate import CountedSubscription, GatedPublisher, NodeGate
+from lifecycle.node.machine import RefusedError
+from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
-    from lifecycle.node.endpoints.data_layer import DataLayer
+    from lifecycle.node.data_layer import DataLayer
     from lifecycle.node.host.loop import NodeLoop
 
 

@@ -30,6 +30,7 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
 from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
 from lifecycle.node.host.control import (
     Command,
@@ -41,7 +42,6 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop, on_signal
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 

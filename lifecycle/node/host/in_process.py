@@ -22,10 +22,10 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
+from lifecycle.node.callbacks import CallbackOutcome, Result
 from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
-from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 
 WAIT_S = 10.0

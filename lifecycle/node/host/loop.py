@@ -41,8 +41,8 @@ from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.executor import NodeExecutor, described, run
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import Watching
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.lifecycle.steps import hint
+from lifecycle.node.callbacks import hint
+from lifecycle.node.managed import Managed
 
 if TYPE_CHECKING:
     from lifecycle.node.host.adoption import Hosted

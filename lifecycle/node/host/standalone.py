@@ -29,11 +29,11 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.middleware.process.stacks import brief
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import is_auto
+from lifecycle.node.callbacks import CallbackOutcome
 from lifecycle.node.host.adoption import Adoption, Hosted
 from lifecycle.node.host.loop import NodeLoop, on_signal
-from lifecycle.node.lifecycle.steps import CallbackOutcome
+from lifecycle.node.managed import Managed
+from lifecycle.node.planned import is_auto
 from lifecycle.plan.model import PlannedNode
 
 _REPEATED_AFTER_S = (0.1, 0.3)

@@ -11,7 +11,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header, String
 
 from lifecycle.manifest.qos import Durability, History, QosProfile
-from lifecycle.node.endpoints.publisher import Kept
+from lifecycle.node.gate import Kept
 
 
 class FakePublisher:

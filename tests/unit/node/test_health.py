@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from lifecycle.manifest.model import Health
-from lifecycle.node.lifecycle import health
-from lifecycle.node.lifecycle.health import HealthCheck
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node import callbacks
+from lifecycle.node.callbacks import HealthCheck
+from lifecycle.node.machine import NodeState
 from lifecycle.verify.observation import HealthReport
 
 OK = HealthReport(ok=True)
@@ -26,7 +26,7 @@ class Bench:
         self.ticks: list[Callable[[], None]] = []
         self.changes: list[HealthReport | None] = []
         self.traces: list[str] = []
-        monkeypatch.setattr(health.time, "monotonic", lambda: self.now_s)
+        monkeypatch.setattr(callbacks.time, "monotonic", lambda: self.now_s)
         self.check = HealthCheck(
             check,
             self,  # type: ignore[arg-type]

@@ -12,14 +12,14 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
-from lifecycle.node.lifecycle.machine import (
+from lifecycle.node.callbacks import CallbackOutcome, Result
+from lifecycle.node.machine import (
     Machine,
     NodeState,
     RefusedError,
     Transition,
     TransitionRequest,
 )
-from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 
 S, R = NodeState, TransitionRequest
 OK, FAILURE, ERROR = CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR

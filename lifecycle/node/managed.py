@@ -15,25 +15,22 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Health
-from lifecycle.node import configuration
-from lifecycle.node.author import parameters
-from lifecycle.node.author.handlers import alternatives, match
+from lifecycle.node import configuration, services
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
-from lifecycle.node.connections.connection_status import ConnectionEvents
-from lifecycle.node.connections.node_interface import acts_of, serve_interface
-from lifecycle.node.endpoints.data_layer import DataLayer
-from lifecycle.node.lifecycle import services
-from lifecycle.node.lifecycle.gate import NodeGate
-from lifecycle.node.lifecycle.health import HealthCheck
-from lifecycle.node.lifecycle.machine import (
+from lifecycle.node.connections import ConnectionEvents
+from lifecycle.node.data_layer import DataLayer
+from lifecycle.node.gate import NodeGate
+from lifecycle.node.handlers import alternatives, match
+from lifecycle.node.machine import (
     Machine,
     NodeState,
     RefusedError,
     Transition,
     TransitionRequest,
 )
-from lifecycle.node.lifecycle.services import Turns
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
+from lifecycle.node.planned import declare_parameters
+from lifecycle.node.services import Turns, acts_of, serve_interface
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -200,7 +197,7 @@ class Managed:
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
         handlers, timed = match(self.node, self.data_layer.unhandled, name=self.full_name)
-        parameters.declare(self.node, self.spec)
+        declare_parameters(self.node, self.spec)
         self.data_layer.prepare(handlers)
         for method, period_s in timed:
             self._method_timers.append(self.node.create_timer(period_s, method))

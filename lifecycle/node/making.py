@@ -1,15 +1,17 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
 The factories of our own node are for what its author's code makes. What exists where is
-data_layer.py's.
+data_layer.py's. Blocking calls of what is made here raise where they would wait for ever.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
@@ -20,14 +22,13 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
-from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
-from lifecycle.node.lifecycle.gate import GatedSubscription
-from lifecycle.node.lifecycle.steps import called
+from lifecycle.node.callbacks import called
+from lifecycle.node.endpoint import CLIENTS, Endpoint, wire_name
+from lifecycle.node.gate import GatedSubscription
 
 if TYPE_CHECKING:
-    from lifecycle.node.author.managed import Managed
-    from lifecycle.node.connections.connections import Connection
+    from lifecycle.node.connections import Connection
+    from lifecycle.node.managed import Managed
 
 
 _DESTROY = {
@@ -219,3 +220,47 @@ def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
         return response if returned is None else returned
 
     return answer
+
+
+_SPINNING = {
+    ("rclpy.executors", "spin_once"),
+    ("rclpy.executors", "spin_once_until_future_complete"),
+    ("lifecycle.node.host.loop", "turn"),
+    ("lifecycle.node.host.loop", "_spin"),
+}
+"""Where a single-threaded executor calls back: rclpy's, and those of our own processes."""
+
+
+class DeadlockError(LifecycleError):
+    """A blocking call was made in the thread that would have to bring its answer."""
+
+
+def refuse_to_deadlock(client: Client) -> None:
+    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
+    blocking = client.call
+
+    @functools.wraps(blocking)
+    def call(*arguments: Any, **options: Any) -> Any:
+        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
+        return blocking(*arguments, **options)
+
+    client.call = call
+
+
+def refuse_to_block(what: str, instead: str) -> None:
+    """Raise DeadlockError inside the executor, where waiting for `what` would never end.
+
+    Args:
+        what: that an answer is awaited of.
+        instead: what can be awaited.
+    """
+    # A multi-threaded executor runs callbacks in other threads than the one that spins.
+    frame = inspect.currentframe()
+    while frame is not None:
+        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
+            raise DeadlockError(
+                f"cannot wait for {what} in a callback: the answer comes by the executor that "
+                "waits for this callback",
+                hint=f"write `async def` and `await {instead}`",
+            )
+        frame = frame.f_back

@@ -29,23 +29,26 @@ from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.author.blocking import refuse_to_deadlock
-from lifecycle.node.author.handlers import ActionHandler
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import (
+from lifecycle.node.connections import Connection, ConnectionEvent, connections_of
+from lifecycle.node.endpoint import Placement, interface_name
+from lifecycle.node.gate import (
+    DeclaredPublisher,
+    GatedPublisher,
+    GatedSubscription,
+    GatedTimer,
+    NodeGate,
+)
+from lifecycle.node.handlers import ActionHandler
+from lifecycle.node.machine import NodeState
+from lifecycle.node.making import refuse_to_deadlock, resolve_name
+from lifecycle.node.managed import Managed
+from lifecycle.node.planned import (
     Construction,
     calling_position,
     default_name,
     is_auto,
     plan_without_manifest,
 )
-from lifecycle.node.connections.connection_status import ConnectionEvent
-from lifecycle.node.connections.connections import Connection, connections_of
-from lifecycle.node.endpoints.endpoint import Placement, interface_name
-from lifecycle.node.endpoints.making import resolve_name
-from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
-from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.outcome import ConnectionReport
 

@@ -24,13 +24,14 @@ import transitions
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
-from lifecycle.node.lifecycle import steps
-from lifecycle.node.lifecycle.steps import (
+from lifecycle.node.callbacks import (
     SUCCESS,
     CallbackOutcome,
     DeadlineError,
     Result,
     Running,
+    called,
+    result_of,
 )
 
 
@@ -403,11 +404,11 @@ class Machine:
         deadline_s: float = getattr(self._timeouts, limit)
         what = f"{self._node.full_name}: {name}"
         late = DeadlineError(f"cannot finish {what} within its deadline of {deadline_s:g} s")
-        running = Running(steps.called(self._node.callback(name), argument))
+        running = Running(called(self._node.callback(name), argument))
         self._running, self._what = running, what
         call_off = self._node.turns.call_after(deadline_s, lambda: self._interrupt(late))
         try:
-            return await steps.result_of(running, what=what, deadline_s=deadline_s)
+            return await result_of(running, what=what, deadline_s=deadline_s)
         finally:
             self._running = None
             call_off()

@@ -22,11 +22,11 @@ from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.node.author.handlers import Key, alternatives, needs_handler
-from lifecycle.node.connections.connections import ConnectError, Connection, Connections
-from lifecycle.node.endpoints.endpoint import (
+from lifecycle.node.connections import ConnectError, Connection, Connections
+from lifecycle.node.endpoint import (
     CLIENTS,
     Endpoint,
+    Handover,
     Placement,
     UnknownEndpointError,
     count_peers,
@@ -34,14 +34,14 @@ from lifecycle.node.endpoints.endpoint import (
     refuse_unfit,
     watch_matches,
 )
-from lifecycle.node.endpoints.handover import Handover
-from lifecycle.node.endpoints.making import Maker
-from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.gate import DeclaredPublisher, Kept
+from lifecycle.node.handlers import Key, alternatives, needs_handler
+from lifecycle.node.machine import NodeState
+from lifecycle.node.making import Maker
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
-    from lifecycle.node.author.managed import Managed
+    from lifecycle.node.managed import Managed
 
 _CONFIGURED = frozenset(
     {

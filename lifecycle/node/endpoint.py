@@ -1,4 +1,4 @@
-"""One endpoint of a node: what it is, how code wants it made, and where it is now.
+"""One endpoint of a node: what it is, how code wants it made, where it is now, and its handover.
 
 rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
@@ -17,11 +17,12 @@ from rclpy.event_handler import (
     UnsupportedEventTypeError,
 )
 from rclpy.publisher import Publisher
+from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.author.handlers import Key
-from lifecycle.node.connections.connections import Connection
+from lifecycle.node.connections import Connection
+from lifecycle.node.handlers import Key
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
-    from lifecycle.node.endpoints.handover import Handover
-    from lifecycle.node.endpoints.publisher import DeclaredPublisher
+    from lifecycle.node.gate import DeclaredPublisher
+    from lifecycle.node.services import Turns
 
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
@@ -249,3 +250,54 @@ def interface_name(interface: type[Any]) -> str:
             "give a message, service or action class such as std_msgs.msg.String"
         )
     return f"{package}/{kind}/{interface.__name__}"
+
+
+SETTLE_S = 0.25
+"""The old one lives on after the new one has matched as many peers as it had."""
+
+PATIENCE_S = 4.0
+"""Both live at most so long, if the new one never matches as many.
+
+A participant that others have not noticed at once is announced again after 3 s.
+"""
+
+
+class Handover:
+    """One endpoint that is handed over.
+
+    Args:
+        old: where it is until then.
+        peers_before: how many peers it had there.
+        turns: of its node.
+        finish: destroys the old one; called exactly once.
+
+    Attributes:
+        old: as given.
+        done: the old one is destroyed.
+    """
+
+    def __init__(
+        self, old: Placement, peers_before: int, turns: Turns, finish: Callable[[], None]
+    ) -> None:
+        self.old = old
+        self.done: Future = Future()
+        self._peers_before = peers_before
+        self._turns = turns
+        self._finish = finish
+        self._settles = False
+        self._call_off = turns.call_after(PATIENCE_S, self.end)
+
+    def peers_changed(self, peers: int) -> None:
+        """The new one has so many peers now."""
+        if peers >= self._peers_before and not self._settles and not self.done.done():
+            self._settles = True
+            self._call_off()
+            self._call_off = self._turns.call_after(SETTLE_S, self.end)
+
+    def end(self) -> None:
+        """Break now; again is harmless."""
+        if self.done.done():
+            return
+        self._call_off()
+        self.done.set_result(None)
+        self._finish()
