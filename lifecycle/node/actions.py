@@ -146,10 +146,6 @@ class Goals:
 def resolve_action_name(node: Node, name: str) -> str:
     """Return the fully qualified name of an action of `node`, after its remapping rules.
 
-    Args:
-        node: with its namespace and rules.
-        name: relative, absolute or private.
-
     Raises:
         NameNotLegalError: the rules give its hidden names different actions.
     """

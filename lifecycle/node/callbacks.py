@@ -59,8 +59,7 @@ _RCLPY_TYPE = "TransitionCallbackReturnType"
 class Running:
     """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
 
-    rclpy has no running asyncio loop: an awaiting task is resumed each time its executor wakes, so
-    whoever interrupts it has to wake the executor.
+    An awaiting task is resumed each time that the executor wakes: who interrupts it has to wake it.
 
     Attributes:
         returned: what it returned.
@@ -177,10 +176,7 @@ def _raised(error: Exception, trace: str, *, what: str) -> Result:
 
 
 def error_text(error: Exception) -> str:
-    """Return what was raised in one line, and what to do about it where the text does not say it.
-
-    asyncio says `no running event loop` of whatever is awaited of it, `asyncio.sleep` first of all.
-    """
+    """Return what was raised in one line, and what to do about it."""
     todo = hint(error)
     return f"{type(error).__name__}: {error}" + (f"; {todo}" if todo else "")
 
@@ -196,10 +192,9 @@ def hint(error: Exception) -> str:
 
 
 def judge(returned: object, *, what: str) -> Result:
-    """Turn a callback's return value into a Result.
+    """Turn a callback's return value into a Result; what is none is an ERROR.
 
-    None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name, so that this needs no
-    rclpy. Anything else is an ERROR, also where rclpy would break.
+    None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name.
     """
     name = "SUCCESS" if returned is None else getattr(returned, "name", "")
     known = (
@@ -236,7 +231,7 @@ _LONGEST = 200
 
 
 class HealthCheck:
-    """Asks one node how it is.
+    """Asks one node how it is: once connected, at each change of its state, and at an interval.
 
     Args:
         check: returns None, True or "" if all is well, else what is wrong; may be async.

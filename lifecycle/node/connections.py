@@ -1,8 +1,7 @@
 """The connections of one node: extra participants that its endpoints can be mapped onto.
 
-`connect_to` of *Topological Discovery and Communication Negotiation*, and its "Node Interface"
-(introspection by notification): events are what is different in two configurations of a node.
-Which endpoint is on which connection is data_layer.py's.
+`connect_to` of *Topological Discovery and Communication Negotiation*, and its introspection by
+notification: events are what is different in two configurations of a node.
 """
 
 from __future__ import annotations
@@ -53,7 +52,6 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
         urls: what it was made from, as text; empty if the RMW chose.
         node_name: base name of the hidden node that owns the participant; empty for the node's own.
         participant: None for the node's own, and once disconnected.
-        has_shared_memory: it has that transport.
         warning: what of it could not be made as asked, while the rest was; empty otherwise.
         error: why it could not be made; empty if it was.
     """
@@ -82,12 +80,7 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
 
 
 class Connections:
-    """All connections of one node; its own participant is always one of them.
-
-    Args:
-        node: whose they are.
-        planned: the participants that it may get beside its own.
-    """
+    """All connections of one node; its own participant is always one of them."""
 
     def __init__(self, node: Node, planned: Iterable[PlannedParticipant]) -> None:
         self._node = node
@@ -177,11 +170,7 @@ class Connections:
     def planned(self, name: str) -> Connection:
         """Return the connection on a participant of the plan, made at first use.
 
-        Args:
-            name: of the participant; one that the plan has not is the node's own.
-
-        Raises:
-            LifecycleError: it could not be made.
+        The node's own, if the plan has none of this name; raises LifecycleError.
         """
         planned = self._planned.get(name)
         if planned is None:
@@ -224,10 +213,7 @@ class Connections:
     def _make(
         self, name: str, how: ParticipantConnections, planned: PlannedParticipant
     ) -> Connection:
-        """Make a participant; without its DSCP where that cannot be applied.
-
-        An unmarked flow is the verifier's to judge (`enforce`), so it is reported, not fatal here.
-        """
+        """Make a participant; without its DSCP, which the verifier judges, where that fails."""
         make = functools.partial(
             FlowParticipant,
             planned.name,

@@ -42,12 +42,7 @@ class UnknownEndpointError(LifecycleError, KeyError):
 
 
 def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
-    """Return the endpoint that a spelling means.
-
-    Args:
-        spelling: `publishers/video`, or the declared name alone where no other kind has it.
-        declared: every declared endpoint.
-        node: fully qualified node name, for messages.
+    """Return the endpoint that `publishers/video` means, or `video` if one kind of `node` has it.
 
     Raises:
         UnknownEndpointError: it means none, or more than one.
@@ -108,7 +103,7 @@ def watch_matches(
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
-        entity: what to watch.
+        entity: the endpoint.
         group: reentrant.
         changed: is called.
 
@@ -179,8 +174,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         error: why it could not be made as asked; empty if it was.
         fault: what its handler raised at the last goal of an action; empty if it returned.
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
-        lossy: the author's hint: the data bear an unreliable transport; None without one.
-        size_bytes: the author's hint: its largest serialized message; None without one.
+        lossy, size_bytes: the author's hints for negotiation; None without one.
         options: how it is made, as far as code says it by `set_options`.
     """
 
@@ -237,11 +231,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
 
 
 def interface_name(interface: type[Any]) -> str:
-    """Return `package/msg/Type` of a generated class.
-
-    Raises:
-        LifecycleError: not a generated message, service or action class.
-    """
+    """Return `package/msg/Type` of a generated class; raises LifecycleError for another."""
     package, _, rest = interface.__module__.partition(".")
     kind = rest.partition(".")[0]
     if kind not in {"msg", "srv", "action"}:
@@ -263,16 +253,18 @@ A participant that others have not noticed at once is announced again after 3 s.
 
 
 class Handover:
-    """One endpoint that is handed over.
+    """The time in which an endpoint is on two connections: make before break.
+
+    Both ends of a flow learn of each other at different moments, so a match seen here does not
+    prove that the other side has seen it: the old one stays a little longer than that. Meanwhile a
+    publisher publishes by the old one, and a subscription receives by both.
 
     Args:
         old: where it is until then.
         peers_before: how many peers it had there.
-        turns: of its node.
         finish: destroys the old one; called exactly once.
 
     Attributes:
-        old: as given.
         done: the old one is destroyed.
     """
 

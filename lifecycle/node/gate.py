@@ -51,11 +51,8 @@ class Gated(Protocol):
 class NodeGate:
     """All gated entities of one node; closed until the node is active.
 
-    Args:
-        counts: callbacks of subscriptions get message info, as `executor: events` has it not.
-
     Attributes:
-        counts: as given.
+        counts: callbacks of subscriptions get message info, as `executor: events` has it not.
         is_open: data may flow.
         apart: topics that are published by another host's clock.
     """
@@ -149,8 +146,8 @@ class GatedPublisher:
 class CountedSubscription:
     """Counts what arrives while open: `lifecycle.measure`. Closed it leaves messages alone.
 
-    rclpy decides by the callback's signature, once per message, whether to pass the message info. A
-    callback of ours takes it always, so that a swap between take and call changes nothing.
+    A callback of ours takes message info always: rclpy decides that for each message before the
+    gate may swap the callback.
 
     Raises:
         LifecycleError: its callback takes message info, and its node's gate counts nothing.
@@ -195,8 +192,8 @@ class CountedSubscription:
 class GatedSubscription(CountedSubscription):
     """Takes and drops messages while closed, so that old ones do not wait for activation.
 
-    A TRANSIENT_LOCAL sample is state, not an event: its publisher, activated before us, sends it
-    once. So the last `depth` of those are kept while closed and given to the callback when opened.
+    A TRANSIENT_LOCAL sample is state, not an event, and sent once. So the last `depth` of those are
+    kept while closed and given to the callback when opened.
     """
 
     def __init__(self, subscription: Subscription, gate: NodeGate, later: Later) -> None:
@@ -264,10 +261,7 @@ def counting(call: Callable[[Any, Info], Any], counter: Counter) -> Callable[[An
 
 
 class GatedTimer:
-    """Runs while open unless the user cancelled it; calls to cancel and reset keep their meaning.
-
-    A timer starts its period anew when the node becomes active.
-    """
+    """Runs while open, from then on, unless the user cancelled it; reset keeps its meaning."""
 
     def __init__(self, timer: Timer, *, wanted: bool) -> None:
         self._timer = timer
@@ -313,10 +307,12 @@ _SYSTEM_DEFAULT_DEPTH = 1
 
 
 class Kept:
-    """The last messages of one publisher, serialized.
+    """The last messages of one publisher, serialized: its TRANSIENT_LOCAL history.
+
+    DDS keeps it in the writer, and each connection has a writer of its own (DDS 1.4, 2.2.3.4).
 
     Args:
-        depth: how many, > 0.
+        depth: how many, > 0; None for all.
         lifespan_ns: older ones are not worth anything any more; None for ever.
     """
 
@@ -326,10 +322,7 @@ class Kept:
 
     @classmethod
     def of(cls, qos: QosProfile | None) -> Kept | None:
-        """Return what keeps for a publisher of this QoS; None where nothing is kept.
-
-        KEEP_ALL has no bound, so nothing of it is taken along.
-        """
+        """Return what keeps for a publisher of this QoS; None where nothing, or all, is kept."""
         if qos is None or qos.durability is not Durability.TRANSIENT_LOCAL:
             return None
         if qos.history is History.KEEP_ALL:
@@ -338,11 +331,7 @@ class Kept:
         return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
 
     def publish(self, msg: Any, publisher: Publisher) -> None:
-        """Publish a message, or serialized bytes, and keep it as it is now.
-
-        Raises:
-            TypeError: it is of another type, as rclpy says it.
-        """
+        """Publish a message, or serialized bytes, and keep it as it is now."""
         data = serialize_message(msg) if isinstance(msg, publisher.msg_type) else msg
         publisher.publish(data)
         self._samples.append((time.monotonic_ns(), data))
@@ -364,20 +353,13 @@ class Kept:
 class DeclaredPublisher:
     """Publishes on a declared topic while the node is active; drops otherwise.
 
-    While the node is active `publish` is rclpy's own bound method: an open gate costs nothing. Only
-    a TRANSIENT_LOCAL publisher keeps what it sends, to take it along to another connection.
+    While the node is active `publish` is rclpy's own bound method. Only a TRANSIENT_LOCAL publisher
+    keeps what it sends, to take it along to another connection.
 
     Example:
-        >>> def on_configure(self):
-        ...     self.video = self.publisher("video")
         >>> @on_timer(period_s=0.05)
         ... def tick(self):
-        ...     self.video.publish(self.camera.read())
-
-    Args:
-        name: as declared.
-        warn: called with what is dropped.
-        kept: keeps what is sent; None where nothing is kept.
+        ...     self.publisher("video").publish(self.camera.read())
 
     Attributes:
         name: as declared.

@@ -5,8 +5,7 @@ default_state_machine.c, with connect nested inside inactive. Whatever happens t
 a row of `TABLE`, or in the author's callback between two of them. Knows no rclpy.
 
 A transition has two halves, as in rcl: a *request* moves a primary state into a transition state
-(`unconfigured` → `configuring`), and the callback's *outcome* moves it on. The data layer
-(connected or not) is part of the state, so nothing else needs to remember it.
+(`unconfigured` → `configuring`), and the callback's *outcome* moves it on.
 """
 
 from __future__ import annotations
@@ -137,14 +136,14 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One line of the table.
+    """One line of the table; methods are those of the node's managed half, or of a part of it.
 
     Attributes:
         id: of the edge that other tools see; 0 where they see none.
         trigger: a request or an outcome.
-        condition: method of the node's managed half that must be true, or raises RefusedError.
-        before: method of it, or of a part of it, that is called before the state changes.
-        after: such a method, called once the state has changed.
+        condition: method that must be true, or raises RefusedError.
+        before: method that is called before the state changes.
+        after: method that is called once the state has changed.
     """
 
     id: int
@@ -263,7 +262,6 @@ class Machine:
     Args:
         node: has the methods that the table names, and what the author's callbacks need:
             managed.Managed.
-        timeouts: deadlines of the callbacks.
         table: TABLE; tests take lines out.
 
     Attributes:
@@ -304,8 +302,7 @@ class Machine:
     def available_transitions(self) -> tuple[Transition, ...]:
         """What get_available_transitions answers: rcl's edges from the state that others see.
 
-        From connected, disconnect is offered, and from disconnected, connect. While connecting or
-        disconnecting nothing can be asked for, so nothing is offered.
+        From connected, disconnect is offered, and from disconnected, connect.
         """
         if self.state in {NodeState.CONNECTING, NodeState.DISCONNECTING}:
             return ()
@@ -325,11 +322,7 @@ class Machine:
         return None
 
     async def change(self, request: TransitionRequest, *, permitted: bool = False) -> Result:
-        """Run a whole transition, with everything it takes on the way.
-
-        Args:
-            request: what is asked for.
-            permitted: by the supervisor, through its gate.
+        """Run a whole transition, `permitted` by the supervisor, with everything it takes on the way.
 
         Returns:
             SUCCESS, or the first step's result that was not: after an ERROR, on_error has run and
@@ -354,10 +347,7 @@ class Machine:
         return returned
 
     async def shut_down(self, reason: str) -> Result:
-        """Bring the node to finalized from wherever it is, because its process must end.
-
-        A running async callback is cancelled first; each step keeps its own deadline.
-        """
+        """Bring the node to finalized from any state; a running async callback is cancelled."""
         if not self.state.steady:
             self._interrupt(LifecycleError(f"cannot go on with {self._what}: {reason}"))
             while not self.state.steady:

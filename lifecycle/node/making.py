@@ -40,10 +40,7 @@ _DESTROY = {
 
 
 class Maker:
-    """Makes and destroys the entities of one node, whose executor runs their callbacks.
-
-    Its gate holds subscriptions back; publishers are held back by their handles.
-    """
+    """Makes and destroys the entities of one node, whose executor runs their callbacks."""
 
     def __init__(self, managed: Managed) -> None:
         self._node = managed.node
@@ -52,11 +49,7 @@ class Maker:
         self._changed = managed.configuration_changes.touch
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
-        """Return a new rclpy entity of an endpoint on a connection.
-
-        Raises:
-            LifecycleError: the RMW refused, with its reason; nothing is left.
-        """
+        """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
         kind, introspection = endpoint.kind, endpoint.options.get("introspection")
         make = self._served
         if kind is EndpointKind.PUBLISHER:
@@ -89,11 +82,7 @@ class Maker:
             getattr(self._node, _DESTROY[kind])(entity)
 
     def expand(self, endpoint: Endpoint, name: str) -> str:
-        """Return a new name for an endpoint fully qualified; no remapping rule applies.
-
-        Raises:
-            LifecycleError: it cannot be a name.
-        """
+        """Return a new name for an endpoint fully qualified; no remapping rule applies."""
         resolve = self._node.resolve_service_name
         if endpoint.kind.is_topic:
             resolve = self._node.resolve_topic_name
@@ -178,10 +167,7 @@ class Maker:
         return service
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
-        """Return what an endpoint is called where it is made.
-
-        The hidden nodes of other participants resolve nothing: remaps belong to our node.
-        """
+        """Return what an endpoint is called where it is made: hidden nodes resolve nothing."""
         if endpoint.given_name or connection.participant is None:
             return endpoint.given_name or endpoint.name
         return resolve_name(self._node, endpoint.kind, endpoint.name)
@@ -248,12 +234,7 @@ def refuse_to_deadlock(client: Client) -> None:
 
 
 def refuse_to_block(what: str, instead: str) -> None:
-    """Raise DeadlockError inside the executor, where waiting for `what` would never end.
-
-    Args:
-        what: that an answer is awaited of.
-        instead: what can be awaited.
-    """
+    """Raise DeadlockError inside the executor, where waiting for `what` would never end."""
     # A multi-threaded executor runs callbacks in other threads than the one that spins.
     frame = inspect.currentframe()
     while frame is not None:

@@ -1,7 +1,4 @@
-"""The managed half of a LifecycleNode: machine, gate, data layer, services put together.
-
-It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
-"""
+"""The managed half of a LifecycleNode: machine, gate, data layer, services put together."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Health
+from lifecycle.manifest.model import Executor, Health
 from lifecycle.node import configuration, services
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
@@ -36,6 +33,7 @@ from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
+    from lifecycle.node.gate import Later
 
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
@@ -44,20 +42,20 @@ _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, 
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
-class Managed:
-    """The managed half of one node.
+class NodeInHost:
+    """What a process knows of one of its nodes, whatever class it is of.
+
+    Args:
+        supervisor: name of the system whose gate holds it; empty for none.
+        later: runs a function in the executor of the node, or beside it.
+        collect: returns its configuration as it is now.
 
     Attributes:
-        node: the LifecycleNode.
+        node: rclpy's.
         full_name: its name, fully qualified.
+        spec: what it was planned to be.
+        gate: holds back what it sends, receives and times, and counts what arrives.
         listeners: are called with it after every change of state, whatever caused it.
-        auto: it brings itself up, unless its host says otherwise.
-        gate: holds back what the node was made to send, receive and time.
-        turns: has things done in its executor.
-        spec: what the node was planned to be.
-        data_layer: its endpoints.
-        connections: its participants.
-        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories.
     """
@@ -66,12 +64,9 @@ class Managed:
         self,
         node: Node,
         spec: PlannedNode,
-        auto: bool,
-        gate: NodeGate,
-        supervisor: str = "",
-        *,
-        served: bool = True,
-        health: Callable[[], Any] | None = None,
+        supervisor: str,
+        later: Later,
+        collect: Callable[[], NodeConfiguration],
     ) -> None:
         self.node = node
         self.full_name = str(node.get_fully_qualified_name())
@@ -79,23 +74,51 @@ class Managed:
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
-        self.auto = auto
-        self.gate = gate
-        self.turns = Turns(node)
+        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self.listeners: list[Callable[[Any], None]] = []
+        failed = node.get_logger().error
+        self.configuration_changes = ConfigurationChanges(later, collect, failed=failed)
+        changed = self.configuration_changes.touch
+        node.add_post_set_parameters_callback(lambda _: changed())
+        self.found = Found(spec.at, changed)
+
+
+class Managed(NodeInHost):
+    """The managed half of one LifecycleNode.
+
+    Attributes:
+        auto: it brings itself up, unless its host says otherwise.
+        turns: has things done in its executor.
+        data_layer: its endpoints.
+        connections: its participants.
+        connection_events: what becomes of its connections and mappings.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        spec: PlannedNode,
+        auto: bool,
+        supervisor: str = "",
+        *,
+        served: bool = True,
+        health: Callable[[], Any] | None = None,
+    ) -> None:
+        self.turns = Turns(node)
+        super().__init__(node, spec, supervisor, self.turns.call_soon, self.get_configuration)
+        self.auto = auto
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
         self._publish: Callable[[Transition], None] = lambda _: None
-        self.configuration_changes = ConfigurationChanges(
-            self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
-        )
-        changed = self.configuration_changes.touch
         self._health: HealthCheck | None = None
         if health is not None:
-            how, failed = spec.health or Health(), node.get_logger().error
-            self._health = HealthCheck(health, self.turns, how, changed=changed, failed=failed)
-        node.add_post_set_parameters_callback(lambda _: changed())
-        self.found = Found(spec.at, changed)
+            self._health = HealthCheck(
+                health,
+                self.turns,
+                spec.health or Health(),
+                changed=self.configuration_changes.touch,
+                failed=node.get_logger().error,
+            )
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
@@ -109,7 +132,7 @@ class Managed:
 
     @property
     def state(self) -> NodeState:
-        """The state, nested ones distinguished; `state.seen` is what other tools see."""
+        """The state; `state.seen` is what other tools see."""
         return self._machine.state
 
     @property
@@ -133,11 +156,7 @@ class Managed:
 
         A node that it lets through may be deactivated and activated again by any client, until the
         supervisor deactivates it or its data layer goes, which is what was verified. A node that
-        another client has deactivated already is where the supervisor wants it.
-
-        Raises:
-            RefusedError: as for `change`.
-            LifecycleError: no such transition.
+        another client has deactivated already is where the supervisor wants it. Raises as `change`.
         """
         known = _known(request)
         if self._supervisor and known is TransitionRequest.DEACTIVATE:
@@ -172,7 +191,7 @@ class Managed:
         end = self.turns.call_every(0.0, once)
 
     def close(self) -> None:
-        """Leave the graph and take the data layer away: the node is being destroyed."""
+        """Leave the graph: the node is being destroyed."""
         self.turns.close()
         self.data_layer.remove()
         if self._reporter is not None:
@@ -231,13 +250,7 @@ class Managed:
                 self.node.get_logger().error(traceback.format_exc())
 
     def changed(self, state: NodeState, event: Transition | None) -> None:
-        """Notify others of a change of the state.
-
-        Args:
-            state: the new one.
-            event: the edge that other tools are to be shown; None for a change that they do not
-                see.
-        """
+        """Notify others of the new state, and other tools of the edge, if they see one."""
         if self._supervisor and state in _WITHOUT_DATA_LAYER:
             self._let_through = False
         if event is not None:

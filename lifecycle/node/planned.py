@@ -51,8 +51,7 @@ class Construction(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         spec: the node's part of the plan; None for a node without a manifest.
-        supervisor: name of the system whose supervisor alone may activate the node, once its gate
-            is open; empty for a node that runs by itself.
+        supervisor: name of the system whose gate holds it; empty for none.
     """
 
     spec: PlannedNode | None
@@ -60,11 +59,7 @@ class Construction(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_auto(word: str) -> bool:
-    """Return whether a node brings itself up, as `lifecycle=` says: "auto", or "manual".
-
-    Raises:
-        LifecycleError: neither of them.
-    """
+    """Return whether a node brings itself up, as `lifecycle=` says: "auto", or "manual"."""
     if word not in ("manual", "auto"):
         raise LifecycleError(f"cannot use lifecycle={word!r}; allowed: 'manual', 'auto'")
     return word == "auto"
@@ -118,12 +113,8 @@ def ros_arguments(spec: PlannedNode) -> list[str]:
 def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any]:
     """Import `package.module:Class` or `package.module:function`.
 
-    It is looked for in the working directory, as `python -m` does, in `folders`, on PYTHONPATH, and
-    in what is installed.
-
-    Args:
-        reference: as the manifest has it.
-        folders: absolute; where the manifest is.
+    It is looked for in the working directory, as `python -m` does, in `folders` (absolute, of the
+    manifest), on PYTHONPATH, and in what is installed.
 
     Raises:
         BringUpError: malformed, no such module, no such name, or a class that is no rclpy node.
@@ -258,11 +249,7 @@ def _declare_empty(
     type_: Parameter.Type,
     descriptor: ParameterDescriptor,
 ) -> Parameter:
-    """Declare a parameter as an empty array of a type, read-only or not.
-
-    Raises:
-        InvalidParameterValueException: a callback of the node refuses it.
-    """
+    """Declare a parameter as an empty array; raises InvalidParameterValueException."""
     writable = copy.copy(descriptor)
     writable.read_only = False
     second = None if descriptor.dynamic_typing else type_

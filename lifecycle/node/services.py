@@ -46,10 +46,7 @@ def serve(
 ) -> Callable[[machine.Transition], None]:
     """Serve a node's state machine; returns what publishes a transition event.
 
-    Args:
-        node: the node to be seen as managed.
-        state_machine: its state machine.
-        group: must be reentrant, so that others can ask while a transition runs.
+    The group must be reentrant, so that others can ask while a transition runs.
     """
     # Not through our node's own create_publisher: this one must work in every state.
     events = Node.create_publisher(
@@ -139,10 +136,7 @@ def _described(edges: Iterable[machine.Transition]) -> srv.GetAvailableTransitio
 
 
 class Turns:
-    """What one node has done in its executor.
-
-    Args:
-        node: whose executor it is, once it has one.
+    """What one node has done in its executor, once it has one.
 
     Attributes:
         group: reentrant, of the timers, the node's services and its clients: others may ask, and
@@ -214,13 +208,7 @@ def acts_of(data_layer: DataLayer) -> Acts:
 
 
 def serve_interface(node: Node, acts: Acts, group: CallbackGroup) -> None:
-    """Serve a node's interface.
-
-    Args:
-        node: that has it.
-        acts: what its services do.
-        group: reentrant, so that others can ask while a transition runs or a handover lasts.
-    """
+    """Serve a node's interface; the group must be reentrant, as a handover lasts."""
     log = node.get_logger().error
     for name, act in acts.items():
         Node.create_service(

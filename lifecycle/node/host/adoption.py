@@ -1,7 +1,4 @@
-"""Make the nodes of the user's classes and functions, each as one planned node.
-
-They get the names, parameters, remaps and participants of the plan.
-"""
+"""Make the nodes of the user's classes and functions, each as one planned node."""
 
 from __future__ import annotations
 
@@ -41,9 +38,6 @@ class Participants:
 
     Nodes of equal transports, datagram size and connection URLs share. The first ones get the
     process's default context, which is what code that names none uses.
-
-    Args:
-        default: that context.
     """
 
     def __init__(self, default: Context) -> None:
@@ -53,11 +47,7 @@ class Participants:
 
     @contextlib.contextmanager
     def carrying(self, settings: ParticipantSettings) -> Iterator[Context]:
-        """Yield the context that a node is to be constructed on, inside the block.
-
-        Raises:
-            LifecycleError: its participant cannot be made as planned.
-        """
+        """Yield the context that a node is to be constructed on, inside the block."""
         context = self._made.get(settings)
         if context is not None:
             yield context
@@ -93,7 +83,6 @@ class Adoption:
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
-        participants: of the process.
         made: what stands for each node, by its key in the plan.
         unfollow: ends that nodes of this process are taken for those of the plan.
     """
@@ -121,12 +110,7 @@ class Adoption:
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
     ) -> tuple[Hosted, ...]:
-        """Construct a planned node, and those of its group that the same call makes.
-
-        Args:
-            planned: the node that is to be made.
-            group: all that `what` may make, `planned` among them.
-            what: the class or function.
+        """Construct a planned node, and those of its group that the same class or function makes.
 
         Raises:
             LifecycleError: something else was made. What the class or function raises passes.
@@ -254,11 +238,7 @@ class Adoption:
 
 
 def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
-    """Import the class or function of one planned node.
-
-    Raises:
-        LifecycleError: it cannot be used as planned. What its module raises passes.
-    """
+    """Import the class or function of one planned node; raises LifecycleError."""
     found = load_nodes(planned.run.python, folders)
     if isinstance(found, type):
         refuse_unmanaged(planned, found)
@@ -266,11 +246,7 @@ def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., An
 
 
 def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
-    """Raise unless a class can be what the plan says.
-
-    Raises:
-        LifecycleError: it is to be managed, and knows nothing of that.
-    """
+    """Raise LifecycleError for a class that is to be managed, and knows nothing of that."""
     known = issubclass(node_class, LifecycleNode) or is_rclpy_managed(node_class)
     if planned.managed and not known:
         raise LifecycleError(

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import QoSPublisherEventType, QoSSubscriptionEventType
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -25,7 +24,7 @@ from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind, Executor
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -37,11 +36,12 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
-from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
+from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.gate import CountedSubscription, GatedPublisher, NodeGate
+from lifecycle.node.gate import CountedSubscription, GatedPublisher
 from lifecycle.node.machine import RefusedError
+from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
@@ -65,10 +65,9 @@ _CONNECTED = ("inactive", "activating", "active", "deactivating")
 
 
 class HeldPublisher(GatedPublisher):
-    """A publisher of a node that does not know of the gate.
+    """A publisher of a node that does not know of the gate, and may publish in its constructor.
 
-    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens:
-    such a node may publish once, in its constructor.
+    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens.
     """
 
     def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
@@ -96,49 +95,30 @@ class HeldPublisher(GatedPublisher):
             )
 
 
-class ForeignNode:
+class ForeignNode(NodeInHost):
     """One hosted node of which the class is not ours; it offers the host what `Managed` does.
 
     Args:
         node: constructed by rclpy so far; its class's constructor may have more to do.
-        spec: what it was planned to be.
-        supervisor: name of the system whose gate holds it; empty for none.
         loop: runs its callbacks.
 
     Attributes:
-        node: rclpy's.
-        full_name: its name, fully qualified.
-        listeners: are called with it after every change of state, whatever caused it.
-        spec: what it was planned to be.
-        gate: holds back what it publishes, and counts what arrives.
-        configuration_changes: notifies of each change of its configuration.
         connections: its participants.
     """
 
     def __init__(self, node: Node, spec: PlannedNode, *, supervisor: str, loop: NodeLoop) -> None:
-        self.node = node
-        self.full_name = str(node.get_fully_qualified_name())
-        self.spec = spec
-        self._supervisor = supervisor
+        super().__init__(node, spec, supervisor, loop.call_beside, self.get_configuration)
         self._loop = loop
         self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
-        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self.connections = Connections(node, spec.participants)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
-        self.listeners: list[Callable[[Any], None]] = []
-        self._let_through = not supervisor
         self._is_spun = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
             self._machine = RclpyStateMachine(node, self)
-        self.configuration_changes = ConfigurationChanges(
-            loop.call_beside, self.get_configuration, failed=node.get_logger().error
-        )
-        self._found = Found(spec.at, self.configuration_changes.touch)
-        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
             self.gate.open()
         self._services = self._serve()
@@ -179,7 +159,7 @@ class ForeignNode:
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
         connection = self._apart.pop(id(entity), self.connections.own)
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
-        endpoint = self._found.add(kind, placement)
+        endpoint = self.found.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
             follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
@@ -228,14 +208,7 @@ class ForeignNode:
         self._unspun.clear()
 
     def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
-        """Make a planned endpoint with a flow of its own, as its factory was asked for it.
-
-        Returns:
-            None for what rclpy is to make.
-
-        Raises:
-            LifecycleError: its participant or its flow cannot be made.
-        """
+        """Make a planned endpoint with a flow of its own; None for what rclpy is to make."""
         planned = self._planned(kind, given.get("topic"))
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
@@ -276,7 +249,7 @@ class ForeignNode:
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
         self.gate.remove(entity)
-        placement = self._found.remove(entity)
+        placement = self.found.remove(entity)
         if placement is None:
             return
         if placement.unwatch is not None:
@@ -286,8 +259,6 @@ class ForeignNode:
 
     def constructed(self) -> None:
         """Its class's constructor has returned: hold it, or have it spun."""
-        if self.spec.log_level:
-            self.node.get_logger().set_level(LoggingSeverity[self.spec.log_level.upper()])
         self._is_constructed = True
         if self._machine is not None:
             self._machine.complete()
@@ -300,7 +271,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in tuple(self._found.endpoints.values()):
+        for each in tuple(self.found.endpoints.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -315,11 +286,7 @@ class ForeignNode:
 
     @property
     def data_layer(self) -> DataLayer:
-        """What maps the endpoints of our nodes.
-
-        Raises:
-            LifecycleError: its own code makes its endpoints.
-        """
+        """What maps the endpoints of our nodes; raises LifecycleError, for it makes them itself."""
         raise LifecycleError(
             f"cannot move the endpoints of {self.full_name}: its class is not a "
             "lifecycle.LifecycleNode, and makes them itself",
@@ -328,7 +295,7 @@ class ForeignNode:
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for each in tuple(self._found.endpoints.values()):
+        for each in tuple(self.found.endpoints.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
         self._watching.drop_services(self._services)

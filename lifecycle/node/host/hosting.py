@@ -377,11 +377,7 @@ def _changed(node: Hosted) -> Result:
 
 
 class _Output:
-    """Standard output and error, which must not break with the supervisor that reads them.
-
-    Args:
-        log: see HostSpec.
-    """
+    """Standard output and error, which must not break with the supervisor that reads them."""
 
     def __init__(self, log: str) -> None:
         self._log = log
