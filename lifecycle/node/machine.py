@@ -322,7 +322,7 @@ class Machine:
         return None
 
     async def change(self, request: TransitionRequest, *, permitted: bool = False) -> Result:
-        """Run a whole transition, `permitted` by the supervisor, with everything it takes on the way.
+        """Run a whole transition, `permitted` by the supervisor or not.
 
         Returns:
             SUCCESS, or the first step's result that was not: after an ERROR, on_error has run and
