@@ -32,6 +32,7 @@ from lifecycle.node.callbacks import (
     called,
     result_of,
 )
+from lifecycle.node.handlers import alternatives
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,16 +115,16 @@ _STEADY = frozenset(
 )
 
 
-class TransitionRequest(enum.Enum):
-    """What may be asked of a node; values are the labels that other tools use."""
-
-    CONFIGURE = "configure"
-    CONNECT = "connect"
-    ACTIVATE = "activate"
-    DEACTIVATE = "deactivate"
-    DISCONNECT = "disconnect"
-    CLEANUP = "cleanup"
-    SHUTDOWN = "shutdown"
+REQUESTS = (
+    "configure",
+    "connect",
+    "activate",
+    "deactivate",
+    "disconnect",
+    "cleanup",
+    "shutdown",
+)
+"""What may be asked of a node, by the labels that other tools use."""
 
 
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
@@ -294,10 +295,10 @@ class Machine:
                 after=[functools.partial(self._announce, row), *methods(row.after)],
             )
 
-    def allowed(self) -> tuple[TransitionRequest, ...]:
-        """Requests that are taken now, in the order of `TransitionRequest`."""
+    def allowed(self) -> str:
+        """Say which requests are taken now."""
         triggers = self._machine.get_triggers(self.state.name)
-        return tuple(each for each in TransitionRequest if each.value in triggers)
+        return ", ".join(each for each in REQUESTS if each in triggers) or "nothing"
 
     def available_transitions(self) -> tuple[Transition, ...]:
         """What get_available_transitions answers: rcl's edges from the state that others see.
@@ -310,7 +311,7 @@ class Machine:
         seen = self.state.seen
         return tuple(t for t in TRANSITION_GRAPH if t.start == seen and t.label != hidden)
 
-    def resolve(self, transition_id: int, label: str = "") -> TransitionRequest | None:
+    def resolve(self, transition_id: int, label: str = "") -> str | None:
         """Return what a ChangeState request means here; None if this state does not offer it.
 
         A label wins over the id, as in rcl_lifecycle.
@@ -318,10 +319,10 @@ class Machine:
         for transition in self.available_transitions():
             if transition.label == label if label else transition.id == transition_id:
                 # Outcomes are edges too, but only the node itself may take them.
-                return next((r for r in TransitionRequest if r.value == transition.label), None)
+                return transition.label if transition.label in REQUESTS else None
         return None
 
-    async def change(self, request: TransitionRequest, *, permitted: bool = False) -> Result:
+    async def change(self, request: str, *, permitted: bool = False) -> Result:
         """Run a whole transition, `permitted` by the supervisor or not.
 
         Returns:
@@ -330,7 +331,12 @@ class Machine:
 
         Raises:
             RefusedError: not allowed in this state, or another transition is running.
+            LifecycleError: no such transition.
         """
+        if request not in REQUESTS:
+            raise LifecycleError(
+                f"cannot take transition {request!r}", hint=alternatives(request, REQUESTS)
+            )
         with self._lock:
             argument = self._node.callback_argument(self.state)
             self.is_permitted = permitted
@@ -354,12 +360,12 @@ class Machine:
                 await _NextTurn()
         if self.state is NodeState.FINALIZED:
             return SUCCESS
-        return await self.change(TransitionRequest.SHUTDOWN)
+        return await self.change("shutdown")
 
-    def _request(self, request: TransitionRequest) -> Result:
+    def _request(self, request: str) -> Result:
         """Begin a transition; what its row cannot do is a failure, as if the callback said so."""
         try:
-            return self._take(request.value)
+            return self._take(request)
         except transitions.MachineError as error:
             raise RefusedError(self._refusal(request)) from error
 
@@ -409,14 +415,13 @@ class Machine:
             self._running.interrupt(error)
         self._node.turns.wake()
 
-    def _refusal(self, request: TransitionRequest) -> str:
+    def _refusal(self, request: str) -> str:
         if not self.state.steady:
             return (
-                f"cannot {request.value} while the node is {self.state.value!r}: "
+                f"cannot {request} while the node is {self.state.value!r}: "
                 "one transition at a time; ask again when it has ended"
             )
-        allowed = ", ".join(each.value for each in self.allowed()) or "nothing"
-        return f"cannot {request.value} in state {self.state.value!r}; allowed here: {allowed}"
+        return f"cannot {request} in state {self.state.value!r}; allowed here: {self.allowed()}"
 
     def _announce(self, row: Row) -> None:
         """Say what was changed; connect and disconnect are seen once they have succeeded."""

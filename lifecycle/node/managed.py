@@ -10,7 +10,6 @@ from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor, Health
 from lifecycle.node import configuration, services
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
@@ -18,13 +17,12 @@ from lifecycle.node.configuration import ConfigurationChanges, Found, HostedStat
 from lifecycle.node.connections import ConnectionEvents
 from lifecycle.node.data_layer import DataLayer
 from lifecycle.node.gate import NodeGate
-from lifecycle.node.handlers import alternatives, match
+from lifecycle.node.handlers import match
 from lifecycle.node.machine import (
     Machine,
     NodeState,
     RefusedError,
     Transition,
-    TransitionRequest,
 )
 from lifecycle.node.planned import declare_parameters
 from lifecycle.node.services import Turns, acts_of, serve_interface
@@ -37,9 +35,6 @@ if TYPE_CHECKING:
 
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
-
-
-BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
 class NodeInHost:
@@ -141,7 +136,7 @@ class Managed(NodeInHost):
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
 
-    async def change(self, request: TransitionRequest | str) -> Result:
+    async def change(self, request: str) -> Result:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
 
         Raises:
@@ -149,25 +144,24 @@ class Managed(NodeInHost):
                 the node's supervisor is closed.
             LifecycleError: no such transition.
         """
-        return await self._machine.change(_known(request))
+        return await self._machine.change(request)
 
-    async def change_for_supervisor(self, request: TransitionRequest | str) -> Result:
+    async def change_for_supervisor(self, request: str) -> Result:
         """Run a transition that the supervisor asked for; its activate is the gate's permit.
 
         A node that it lets through may be deactivated and activated again by any client, until the
         supervisor deactivates it or its data layer goes, which is what was verified. A node that
         another client has deactivated already is where the supervisor wants it. Raises as `change`.
         """
-        known = _known(request)
-        if self._supervisor and known is TransitionRequest.DEACTIVATE:
+        if self._supervisor and request == "deactivate":
             self._let_through = False
             if self.state is NodeState.INACTIVE_CONNECTED:
                 return SUCCESS
-        if known is not TransitionRequest.ACTIVATE:
-            return await self._machine.change(known)
+        if request != "activate":
+            return await self._machine.change(request)
         if self._supervisor and self.state is not NodeState.ACTIVE:
             self._let_through = False  # an earlier permit does not outlast one that fails
-        result = await self._machine.change(known, permitted=True)
+        result = await self._machine.change(request, permitted=True)
         if result.outcome is CallbackOutcome.SUCCESS:
             self._let_through = True
         return result
@@ -175,7 +169,7 @@ class Managed(NodeInHost):
     async def bring_up(self) -> Result:
         """Configure, connect and activate; stops at the first that does not succeed."""
         result = SUCCESS
-        for request in BRING_UP:
+        for request in ("configure", "connect", "activate"):
             result = await self._machine.change(request)
             if result.outcome is not CallbackOutcome.SUCCESS:
                 break
@@ -300,11 +294,3 @@ class Managed(NodeInHost):
             self._reporter.report_configuration(now)
         else:
             self._reporter.report(checksum=now.checksum)
-
-
-def _known(request: TransitionRequest | str) -> TransitionRequest:
-    try:
-        return TransitionRequest(request)
-    except ValueError as error:
-        hint = alternatives(str(request), [each.value for each in TransitionRequest])
-        raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error

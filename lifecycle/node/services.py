@@ -104,10 +104,9 @@ async def _change_state(
     response.success = False
     if resolved is None:
         name = repr(asked.label) if asked.label else f"number {asked.id}"
-        allowed = ", ".join(each.value for each in state_machine.allowed()) or "nothing"
         node.get_logger().warning(
             f"cannot take transition {name} in state {state_machine.state.value!r}; "
-            f"allowed here: {allowed}"
+            f"allowed here: {state_machine.allowed()}"
         )
         return response
     try:
