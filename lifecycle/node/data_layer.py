@@ -177,23 +177,8 @@ class DataLayer:
         declared = self._declared if is_early else self.endpoints
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
-    def publisher(self, name: str) -> DeclaredPublisher:
-        """Return the handle of a declared publisher; raises UnknownEndpointError."""
-        handle = self._find(EndpointKind.PUBLISHER, name).handle
-        assert handle is not None
-        return handle
-
-    def entity(self, kind: EndpointKind, name: str) -> Any:
-        """Return the rclpy object of a declared endpoint: LifecycleNode.client."""
-        entity = self._find(kind, name).entity
-        if entity is None:
-            raise LifecycleError(
-                f"cannot use {kind.noun} {name!r}: {self._name} is not connected; "
-                "endpoints exist from connect until disconnect"
-            )
-        return entity
-
-    def _find(self, kind: EndpointKind, name: str) -> Endpoint:
+    def declared(self, kind: EndpointKind, name: str) -> Endpoint:
+        """Return a declared endpoint; raises UnknownEndpointError."""
         endpoint = self.endpoints.get((kind, name))
         if endpoint is not None:
             return endpoint
@@ -202,6 +187,16 @@ class DataLayer:
         else:
             hint = alternatives(name, [n for k, n in self.endpoints if k is kind])
         raise UnknownEndpointError(f"cannot find {kind.noun} {name!r} of {self._name}", hint=hint)
+
+    def entity(self, kind: EndpointKind, name: str) -> Any:
+        """Return the rclpy object of a declared endpoint: LifecycleNode.client."""
+        entity = self.declared(kind, name).entity
+        if entity is None:
+            raise LifecycleError(
+                f"cannot use {kind.noun} {name!r}: {self._name} is not connected; "
+                "endpoints exist from connect until disconnect"
+            )
+        return entity
 
     # The transitions.
 

@@ -16,15 +16,13 @@ import time
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rclpy.duration import Duration
-from rclpy.serialization import serialize_message
-
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.qos import Durability, History, QosProfile
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.sample import Measured, Sample
 
 if TYPE_CHECKING:
+    from rclpy.duration import Duration
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
@@ -120,6 +118,11 @@ class NodeGate:
 class GatedPublisher:
     """Drops what is published while closed; says so once per inactive period."""
 
+    _warning = (
+        "cannot publish on {!r}: the node is not active, so the message is dropped, and so are "
+        "those that follow until it is active"
+    )
+
     def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
         self._publisher = publisher
         self._warn = warn
@@ -137,10 +140,38 @@ class GatedPublisher:
     def _drop(self, msg: object) -> None:  # noqa: ARG002 - the signature of Publisher.publish
         if not self._warned:
             self._warned = True
-            self._warn(
-                f"cannot publish on {self._publisher.topic!r}: the node is not active, so the "
-                "message is dropped, and so are those that follow until it is active"
-            )
+            self._warn(self._warning.format(self._publisher.topic))
+
+
+class HeldPublisher(GatedPublisher):
+    """A publisher of a node that does not know of the gate, and may publish in its constructor.
+
+    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens.
+    """
+
+    _warning = (
+        "the gate is closed: what is published on {!r} is dropped until the system is verified"
+    )
+
+    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
+        super().__init__(publisher, warn)
+        qos = publisher.qos_profile
+        self._kept: Kept | None = None
+        if qos.durability.name == "TRANSIENT_LOCAL":
+            self._kept = Kept(None if qos.history.name == "KEEP_ALL" else qos.depth or 1)
+
+    def open(self) -> None:
+        """Publish as rclpy does, first what was kept."""
+        super().open()
+        if self._kept is not None:
+            self._kept.send_again(self._publisher)
+            self._kept.forget()
+
+    def _drop(self, msg: object) -> None:
+        if self._kept is None:
+            super()._drop(msg)
+        else:
+            self._kept.add(msg)
 
 
 class CountedSubscription:
@@ -316,7 +347,7 @@ class Kept:
         lifespan_ns: older ones are not worth anything any more; None for ever.
     """
 
-    def __init__(self, depth: int, lifespan_ns: int | None = None) -> None:
+    def __init__(self, depth: int | None, lifespan_ns: int | None = None) -> None:
         self._samples: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
         self._lifespan_ns = lifespan_ns
 
@@ -330,10 +361,11 @@ class Kept:
         depth = qos.depth if qos.history is History.KEEP_LAST else 0
         return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
 
-    def publish(self, msg: Any, publisher: Publisher) -> None:
-        """Publish a message, or serialized bytes, and keep it as it is now."""
-        data = serialize_message(msg) if isinstance(msg, publisher.msg_type) else msg
-        publisher.publish(data)
+    def add(self, msg: Any) -> None:
+        """Keep a message, or serialized bytes, as it is now: its author may change it later."""
+        from rclpy.serialization import serialize_message
+
+        data = msg if isinstance(msg, bytes) else serialize_message(msg)
         self._samples.append((time.monotonic_ns(), data))
 
     def send_again(self, publisher: Publisher) -> None:
@@ -413,8 +445,7 @@ class DeclaredPublisher:
         """
         if self._entity is None:
             return True
-        limit = Duration(seconds=-1) if timeout is None else timeout
-        return bool(self._entity.wait_for_all_acked(limit))
+        return bool(self._entity.wait_for_all_acked(*(() if timeout is None else (timeout,))))
 
     def attach(self, entity: Publisher) -> None:
         """Publish by `entity` from now on; it is another one than before."""
@@ -457,7 +488,8 @@ class DeclaredPublisher:
     def _publish_and_keep(self, msg: Any) -> None:
         assert self._entity is not None
         assert self._kept is not None
-        self._kept.publish(msg, self._entity)
+        self._entity.publish(msg)  # refuses what is of another type
+        self._kept.add(msg)
 
     def _drop(self, msg: Any) -> None:  # noqa: ARG002 - the signature of Publisher.publish
         if not self._warned:

@@ -172,7 +172,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Raises:
             UnknownEndpointError: nothing of that name is declared; a KeyError too.
         """
-        return self.lifecycle.data_layer.publisher(name)
+        handle = self.lifecycle.data_layer.declared(EndpointKind.PUBLISHER, name).handle
+        assert handle is not None
+        return handle
 
     def client(self, name: str) -> Client:
         """Return the declared service client `name`, from on_connect on.

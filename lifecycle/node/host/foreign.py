@@ -8,7 +8,6 @@ answer, and its plain publishers are held until it is activated through the gate
 
 from __future__ import annotations
 
-import collections
 import functools
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +19,6 @@ from rclpy.event_handler import QoSPublisherEventType, QoSSubscriptionEventType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
@@ -39,7 +37,7 @@ from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_tex
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.gate import CountedSubscription, GatedPublisher
+from lifecycle.node.gate import CountedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
@@ -62,37 +60,6 @@ _OPTIONS = ("callback_group", "event_callbacks", "publisher_class", "raw")
 _REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
-
-
-class HeldPublisher(GatedPublisher):
-    """A publisher of a node that does not know of the gate, and may publish in its constructor.
-
-    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens.
-    """
-
-    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
-        super().__init__(publisher, warn)
-        qos = publisher.qos_profile
-        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
-        depth = None if qos.history.name == "KEEP_ALL" else qos.depth or 1
-        self._kept: collections.deque[Any] = collections.deque(maxlen=depth)
-
-    def open(self) -> None:
-        """Publish as rclpy does, first what was kept."""
-        super().open()
-        while self._kept:
-            self._publisher.publish(self._kept.popleft())
-
-    def _drop(self, msg: object) -> None:
-        if self._keeps:
-            # As it is now: its author may change it later.
-            self._kept.append(msg if isinstance(msg, bytes) else serialize_message(msg))
-        elif not self._warned:
-            self._warned = True
-            self._warn(
-                f"the gate is closed: what is published on {self._publisher.topic!r} is dropped "
-                "until the system is verified"
-            )
 
 
 class ForeignNode(NodeInHost):
