@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rclpy.context import Context
 from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.discovery.environment import reach
 from lifecycle.middleware.discovery.prober import Prober
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -105,7 +104,7 @@ class Adoption:
         self._constructed: dict[str, Node] = {}
         self._foreign: dict[int, ForeignNode] = {}
         self.made: dict[str, Hosted] = {}
-        self.unfollow = follow_nodes(self)
+        self.unfollow = follow_nodes(self.constructing, lambda node: self._foreign.get(id(node)))
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
@@ -171,8 +170,6 @@ class Adoption:
                 hint="it must neither spin nor destroy them: the host does",
             )
 
-    # What rclpy's constructors and factories ask.
-
     @contextlib.contextmanager
     def constructing(
         self, node: Node, name: str, options: dict[str, Any]
@@ -203,26 +200,6 @@ class Adoption:
                 node, planned, supervisor=self._supervisor, loop=self._loop
             )
         self._constructed[planned.key] = node
-
-    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
-        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
-        foreign = self._foreign.get(id(node))
-        return None if foreign is None else foreign.make(kind, arguments)
-
-    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
-        """An endpoint of a node exists now."""
-        if foreign := self._foreign.get(id(node)):
-            foreign.made(kind, entity)
-
-    def endpoint_removed(self, node: Node, entity: Any) -> None:
-        """An endpoint of a node is about to be destroyed."""
-        if foreign := self._foreign.get(id(node)):
-            foreign.removed(entity)
-
-    def node_removed(self, node: Node) -> None:
-        """A node is about to be destroyed."""
-        if foreign := self._foreign.pop(id(node), None):
-            foreign.close()
 
     def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
         """Choose whose construction this is: by name among the group, else the one asked for."""

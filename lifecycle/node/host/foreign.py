@@ -265,6 +265,7 @@ class ForeignNode(NodeInHost):
         for each in tuple(self.found.endpoints.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
+        self.found.endpoints.clear()  # rclpy is about to destroy them
         self._watching.drop_services(self._services)
         self.connections.close_all()
 
