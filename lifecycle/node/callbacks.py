@@ -23,7 +23,7 @@ from lifecycle.verify.observation import HealthReport
 
 if TYPE_CHECKING:
     from lifecycle.node.machine import NodeState
-    from lifecycle.node.services import Turns
+    from lifecycle.node.managed import Managed
 
 
 class CallbackOutcome(enum.Enum):
@@ -234,30 +234,17 @@ class HealthCheck:
     """Asks one node how it is: once connected, at each change of its state, and at an interval.
 
     Args:
+        managed: the node, whose configuration has changed with each other `report`.
         check: returns None, True or "" if all is well, else what is wrong; may be async.
-        turns: has it asked in the node's executor.
-        how: interval and deadline.
-        changed: called whenever `report` is another one, or the first in another state.
-        failed: logs a traceback.
 
     Attributes:
         report: the last answer; None while the node is not connected.
     """
 
-    def __init__(
-        self,
-        check: Callable[[], Any],
-        turns: Turns,
-        how: Health,
-        *,
-        changed: Callable[[], object],
-        failed: Callable[[str], object],
-    ) -> None:
+    def __init__(self, managed: Managed, check: Callable[[], Any]) -> None:
+        self._managed = managed
         self._check = check
-        self._turns = turns
-        self._how = how
-        self._changed = changed
-        self._failed = failed
+        self._how = managed.spec.health or Health()
         self._end: Callable[[], None] | None = None
         self._asked_s: float | None = None
         self._round = 0
@@ -276,7 +263,7 @@ class HealthCheck:
             self._end = self.report = None
             return
         if self._end is None:
-            self._end = self._turns.call_every(self._how.interval_s, self._ask)
+            self._end = self._managed.turns.call_every(self._how.interval_s, self._ask)
         self._is_stale = True
         self._ask()
 
@@ -309,19 +296,19 @@ class HealthCheck:
                 self._asked_s = None
                 self._take(report)
 
-        self._turns.call_soon(wait)
+        self._managed.turns.call_soon(wait)
 
     def _raised(self, error: Exception) -> HealthReport:
         said = f"it raised {type(error).__name__}: {error}"[:_LONGEST]
         if self.report is None or self.report.message != said:
-            self._failed("".join(traceback.format_exception(error)))
+            self._managed.log.error("".join(traceback.format_exception(error)))
         return HealthReport(ok=False, message=said)
 
     def _take(self, report: HealthReport) -> None:
         is_stale, self._is_stale = self._is_stale, False
         if is_stale or report != self.report:
             self.report = report
-            self._changed()
+            self._managed.configuration_changes.touch()
 
 
 def _report(answer: object) -> HealthReport:

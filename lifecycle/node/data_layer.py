@@ -243,7 +243,7 @@ class DataLayer:
         endpoint.handler = handler
         self.endpoints[endpoint.key] = endpoint
         if planned.kind is EndpointKind.PUBLISHER:
-            warn = self._node.get_logger().warning
+            warn = self._managed.log.warning
             endpoint.handle = DeclaredPublisher(planned.name, warn, Kept.of(planned.qos))
             self._gate.add(endpoint.handle, endpoint.handle)
         self._changed()

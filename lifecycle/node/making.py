@@ -43,10 +43,10 @@ class Maker:
     """Makes and destroys the entities of one node, whose executor runs their callbacks."""
 
     def __init__(self, managed: Managed) -> None:
+        self._managed = managed
         self._node = managed.node
         self._gate = managed.gate
         self._turns = managed.turns
-        self._changed = managed.configuration_changes.touch
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
         """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
@@ -146,7 +146,7 @@ class Maker:
                 return GoalClient(
                     node, interface, name, group=group, refuse_to_block=refuse_to_block
                 )
-            goals = Goals(self._node, endpoint, self._gate, self._changed)
+            goals = Goals(self._managed, endpoint)
             goals.server = GoalServer(
                 node, interface, name, goals.execute, accept=goals.accept, group=group
             )
@@ -175,7 +175,7 @@ class Maker:
     def _survive_late_answers(self, service: Any, name: str) -> None:
         """Let an answer after its server was destroyed be lost, not end the process."""
         send = service.send_response
-        warn = self._node.get_logger().warning
+        warn = self._managed.log.warning
 
         @functools.wraps(send)
         def send_response(response: Any, header: Any) -> None:

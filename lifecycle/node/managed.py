@@ -10,7 +10,7 @@ from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from lifecycle.manifest.model import Executor, Health
+from lifecycle.manifest.model import Executor
 from lifecycle.node import configuration, services
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
@@ -49,6 +49,7 @@ class NodeInHost:
         node: rclpy's.
         full_name: its name, fully qualified.
         spec: what it was planned to be.
+        log: its logger.
         gate: holds back what it sends, receives and times, and counts what arrives.
         listeners: are called with it after every change of state, whatever caused it.
         configuration_changes: notifies of each change of its configuration.
@@ -71,8 +72,8 @@ class NodeInHost:
         self._let_through = not supervisor
         self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self.listeners: list[Callable[[Any], None]] = []
-        failed = node.get_logger().error
-        self.configuration_changes = ConfigurationChanges(later, collect, failed=failed)
+        self.log = node.get_logger()
+        self.configuration_changes = ConfigurationChanges(later, collect, failed=self.log.error)
         changed = self.configuration_changes.touch
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found = Found(spec.at, changed)
@@ -105,15 +106,7 @@ class Managed(NodeInHost):
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
         self._publish: Callable[[Transition], None] = lambda _: None
-        self._health: HealthCheck | None = None
-        if health is not None:
-            self._health = HealthCheck(
-                health,
-                self.turns,
-                spec.health or Health(),
-                changed=self.configuration_changes.touch,
-                failed=node.get_logger().error,
-            )
+        self._health = None if health is None else HealthCheck(self, health)
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
@@ -269,10 +262,9 @@ class Managed(NodeInHost):
 
     def report(self, result: Result) -> None:
         """Log why a step did not succeed, with the traceback where there is one."""
-        logger = self.node.get_logger()
         if result.trace:
-            logger.error(result.trace)
-        logger.error(result.error)
+            self.log.error(result.trace)
+        self.log.error(result.error)
 
     # Inside.
 

@@ -116,7 +116,7 @@ class ForeignNode(NodeInHost):
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
-            self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
+            self.gate.add(entity, HeldPublisher(entity, self.log.warning))
         elif kind is EndpointKind.SUBSCRIPTION:
             self.gate.add(entity, CountedSubscription(entity, self.gate))
         unwatch: Callable[[], None] | None = None
@@ -347,7 +347,7 @@ class ForeignNode(NodeInHost):
 
     def complain(self, text: str) -> None:
         """Log it."""
-        self.node.get_logger().error(text)
+        self.log.error(text)
 
     def _release(self) -> None:
         self._let_through = True

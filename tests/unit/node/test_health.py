@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,13 +28,14 @@ class Bench:
         self.changes: list[HealthReport | None] = []
         self.traces: list[str] = []
         monkeypatch.setattr(callbacks.time, "monotonic", lambda: self.now_s)
-        self.check = HealthCheck(
-            check,
-            self,  # type: ignore[arg-type]
-            Health(check=True, interval_s=2.0, timeout_s=3.0),
-            changed=lambda: self.changes.append(self.check.report),
-            failed=self.traces.append,
+        touch = lambda: self.changes.append(self.check.report)  # noqa: E731
+        managed: Any = SimpleNamespace(
+            turns=self,
+            spec=SimpleNamespace(health=Health(check=True, interval_s=2.0, timeout_s=3.0)),
+            configuration_changes=SimpleNamespace(touch=touch),
+            log=SimpleNamespace(error=self.traces.append),
         )
+        self.check = HealthCheck(managed, check)
 
     # What it asks of its turns.
 
