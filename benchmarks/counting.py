@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 
 from lifecycle.measure.counter import Counter
-from lifecycle.node.lifecycle.gate import counting
+from lifecycle.node.gate import counting
 
 MESSAGES = 100_000
 RUNS = 7

@@ -12,15 +12,15 @@ from lifecycle.public import public_name
 
 if TYPE_CHECKING:
     from lifecycle.node.actions import GoalInterruptedError
-    from lifecycle.node.author.handlers import on_action, on_goal, on_message, on_service, on_timer
-    from lifecycle.node.author.node import (
+    from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
+    from lifecycle.node.host.standalone import run
+    from lifecycle.node.node import (
         ERROR,
         FAILURE,
         SUCCESS,
         LifecycleNode,
         TransitionCallbackReturn,
     )
-    from lifecycle.node.host.standalone import run
 
 __all__ = [
     "ERROR",
@@ -40,14 +40,14 @@ __all__ = [
 
 _PUBLIC: dict[str, tuple[str, ...]] = {
     "lifecycle.node.actions": ("GoalInterruptedError",),
-    "lifecycle.node.author.handlers": (
+    "lifecycle.node.handlers": (
         "on_action",
         "on_goal",
         "on_message",
         "on_service",
         "on_timer",
     ),
-    "lifecycle.node.author.node": (
+    "lifecycle.node.node": (
         "ERROR",
         "FAILURE",
         "LifecycleNode",

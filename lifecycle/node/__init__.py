@@ -11,15 +11,12 @@ from typing import TYPE_CHECKING
 from lifecycle.public import public_name
 
 if TYPE_CHECKING:
-    from lifecycle.node.connections.connection_status import ConnectionEvent as ConnectionEvent
-    from lifecycle.node.connections.connection_status import (
-        ConnectionEventKind as ConnectionEventKind,
-    )
-    from lifecycle.node.connections.connections import Connection as Connection
+    from lifecycle.node.connections import Connection as Connection
+    from lifecycle.node.connections import ConnectionEvent as ConnectionEvent
+    from lifecycle.node.connections import ConnectionEventKind as ConnectionEventKind
 
 _PUBLIC: dict[str, tuple[str, ...]] = {
-    "lifecycle.node.connections.connection_status": ("ConnectionEvent", "ConnectionEventKind"),
-    "lifecycle.node.connections.connections": ("Connection",),
+    "lifecycle.node.connections": ("Connection", "ConnectionEvent", "ConnectionEventKind"),
 }
 """What programs import from here (docs/api.md), by the module that has it."""
 

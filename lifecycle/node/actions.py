@@ -7,21 +7,20 @@ that its name is what is left of theirs. `manifest.names.resolve` is the same wi
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.lifecycle.steps import Running, called, error_text
+from lifecycle.node.callbacks import Running, called, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
     from lifecycle.middleware.services.actions import GoalServer
-    from lifecycle.node.endpoints.endpoint import Endpoint
-    from lifecycle.node.lifecycle.gate import NodeGate
+    from lifecycle.node.endpoint import Endpoint
+    from lifecycle.node.managed import Managed
 
 
 class GoalInterruptedError(LifecycleError):
@@ -35,22 +34,16 @@ class GoalInterruptedError(LifecycleError):
 class Goals:
     """The goals of one action server, of which `fault` is what its handler raised last."""
 
-    def __init__(
-        self,
-        node: Node,
-        endpoint: Endpoint,
-        gate: NodeGate,
-        changed: Callable[[], None],
-    ) -> None:
+    def __init__(self, managed: Managed, endpoint: Endpoint) -> None:
         assert endpoint.handler is not None
-        self._node = str(node.get_fully_qualified_name())
+        self._node = managed.full_name
         self._endpoint = endpoint
         self._what = f"action server {endpoint.name!r} of {self._node}"
-        self._log = node.get_logger()
+        self._log = managed.log
         self._handler = endpoint.handler
         self._accept = getattr(endpoint.handler, "accept", None)
-        self._gate = gate
-        self._changed = changed
+        self._gate = managed.gate
+        self._changed = managed.configuration_changes.touch
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None  # set by its maker, before it can have a goal
 
@@ -145,10 +138,6 @@ class Goals:
 
 def resolve_action_name(node: Node, name: str) -> str:
     """Return the fully qualified name of an action of `node`, after its remapping rules.
-
-    Args:
-        node: with its namespace and rules.
-        name: relative, absolute or private.
 
     Raises:
         NameNotLegalError: the rules give its hidden names different actions.

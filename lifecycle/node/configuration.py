@@ -1,11 +1,8 @@
 """The node configuration document: a node's identity, its endpoints as they are, its capabilities.
 
-Of all changes within one turn of the executor one notification is made, and none while there is no
-listener: a configuration costs a millisecond to collect. Its schema is
+It is served at `~/get_configuration` and sent to a supervisor: *Topological Discovery and
+Communication Negotiation*, "Node Configuration Interface". Its schema is
 schemas/node_configuration.v1.schema.json.
-
-It is served at `~/get_configuration` and sent to a supervisor. See *Topological Discovery and
-Communication Negotiation*, "Node Configuration Interface".
 """
 
 from __future__ import annotations
@@ -39,9 +36,8 @@ from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_no
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.node.author import parameters
-from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.endpoint import (
+from lifecycle.node.connections import Connection, Connections
+from lifecycle.node.endpoint import (
     CLIENTS,
     Endpoint,
     Placement,
@@ -49,6 +45,7 @@ from lifecycle.node.endpoints.endpoint import (
     interface_name,
     wire_name,
 )
+from lifecycle.node.planned import parameter_reports
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -64,8 +61,8 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.manifest.diagnostics import Position
+    from lifecycle.node.gate import Later
     from lifecycle.node.host.adoption import Hosted
-    from lifecycle.node.lifecycle.gate import Later
 
 PARADIGMS = ("publish-subscribe", "request-response")
 """Topics; services, and actions, which consist of both."""
@@ -97,8 +94,7 @@ _IPV6_ADDRESSES = "/proc/net/if_inet6"
 def transports() -> tuple[str, ...]:
     """Return what nodes of this process can be connected by, as connection URLs spell it.
 
-    Empty where the RMW's transports are not ours to choose: then what its endpoints' NFEs show is
-    all that is known.
+    Empty where the RMW's transports are not ours to choose.
     """
     if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
         return ()
@@ -124,8 +120,7 @@ _DIGITS = 16
 def checksum(configuration: NodeConfiguration) -> str:
     """Return 16 hex digits that change exactly when a reader must read the document again.
 
-    State, matches, what follows from them (whether a connection is established) and what is
-    measured change all the time and are reported by events, so they do not count.
+    State, matches and what is measured are reported by events, so they do not count.
     """
     stable = replace(
         configuration,
@@ -170,13 +165,7 @@ def collect(
     endpoints: Iterable[Endpoint],
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
-    """Return the configuration of a node as it is now.
-
-    Args:
-        hosted: the node.
-        endpoints: all that it has, declared ones that do not exist among them.
-        health: what it says of itself; None if it says nothing.
-    """
+    """Return the configuration of a node as it is now."""
     node, state = hosted.node, hosted.reported
     reports = endpoint_reports(node, endpoints)
     name, prefix = hosted.full_name, _gid_prefix(node)
@@ -196,7 +185,7 @@ def collect(
         paradigms=PARADIGMS,
         endpoints=reports,
         connections=connection_reports(hosted.spec, hosted.connections, reports),
-        parameters=parameters.reports(node),
+        parameters=parameter_reports(node),
         health=health,
         measured=hosted.gate.measured(),
     )
@@ -273,8 +262,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
 def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoint | None:
     """Return what this process's graph cache says of the node's own endpoint on `topic`.
 
-    It knows own endpoints at once, discovery has no part in it. None if there is none, or if
-    there are several: nothing says which is which.
+    It knows own endpoints at once, discovery has no part in it. None if there are several.
     """
     name = node.get_fully_qualified_name()
     own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
@@ -294,8 +282,7 @@ def _gid_prefix(node: Node) -> str:
 def _prefix_of(connection: Connection) -> str:
     """Return the GID prefix of a connection's own participant in hex; empty if unknown.
 
-    It has nothing but what is mapped onto it, of which this process's graph cache knows at once. Of
-    another process that has a node of this name, it may know too.
+    Of another process that has a node of this name, this process's graph cache may know too.
     """
     node = connection.node
     if node is None:
@@ -312,11 +299,7 @@ def _prefix_of(connection: Connection) -> str:
 def _nfes(
     witness: Node, kind: EndpointKind, entity: Any, connection: Connection
 ) -> tuple[NetworkFlowEndpoint, ...] | None:
-    """Return all NFEs of a connected endpoint, shared memory included.
-
-    rmw_fastrtps lists shared memory for subscriptions only, but what carries a flow depends on
-    both ends having it.
-    """
+    """Return all NFEs of an endpoint; rmw_fastrtps lists shared memory of subscriptions only."""
     publishes = kind is EndpointKind.PUBLISHER
     try:
         nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
@@ -376,11 +359,11 @@ Listener = Callable[["NodeConfiguration"], None]
 
 
 class ConfigurationChanges:
-    """The listeners of one node's configuration.
+    """The listeners of one node's configuration, notified once in a turn of the executor.
 
     Args:
         later: runs a function in the node's executor.
-        collect: returns the configuration as it is now.
+        collect: returns the configuration as it is now; it takes a millisecond.
         failed: called with the traceback if that raises; no listener is notified then.
     """
 

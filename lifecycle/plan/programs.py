@@ -309,7 +309,7 @@ def _names(folder: Path) -> tuple[str, ...]:
 
 
 def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    """Yield what `node.author.handlers.match` would refuse when the node is configured."""
+    """Yield what `node.handlers.match` would refuse when the node is configured."""
     wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
     taken: dict[tuple[EndpointKind, str, bool], Use] = {}
     for each in found.handlers:

@@ -82,8 +82,8 @@ def _say_unlimited(name: str, resources: Resources) -> None:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node.author.spec import load_nodes
     from lifecycle.node.host.standalone import run
+    from lifecycle.node.planned import load_nodes
     from lifecycle.supervisor.processes.logs import check_log_root
 
     check_log_root(os.environ)

@@ -50,47 +50,58 @@ _ACTIONS = {
 
 
 class NodeHooks(Protocol):
-    """What is notified of the nodes of a process."""
+    """What is notified of what a node makes."""
 
-    def constructing(
-        self, node: Node, name: str, options: dict[str, Any]
-    ) -> contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]:
-        """Wrap rclpy's constructor; yields the name and keywords to construct with."""
-
-    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+    def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
         """Make a publisher or subscription that a factory was asked for; None has rclpy make it."""
 
-    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
-        """One of a node's factories, or an action's constructor, is about to return."""
+    def made(self, kind: EndpointKind, entity: Any) -> None:
+        """One of its factories, or an action's constructor, is about to return."""
 
-    def endpoint_removed(self, node: Node, entity: Any) -> None:
+    def removed(self, entity: Any) -> None:
         """An entity is about to be destroyed."""
 
-    def node_removed(self, node: Node) -> None:
-        """A node is about to be destroyed."""
+    def close(self) -> None:
+        """The node is about to be destroyed."""
 
 
-def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
-    """Notify `hooks` of every node of this process from now on; returns what ends that."""
+Constructing = Callable[
+    [Node, str, dict[str, Any]], contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]
+]
+"""Wraps rclpy's constructor; yields the name and keywords to construct with."""
+HooksOf = Callable[[Node], "NodeHooks | None"]
+
+
+def follow_nodes(constructing: Constructing, hooks_of: HooksOf) -> Callable[[], None]:
+    """Follow every node of this process from now on, whatever class it is of.
+
+    Args:
+        constructing: is entered while rclpy constructs a node.
+        hooks_of: returns what is notified of a node; None for nothing.
+
+    Returns:
+        What ends that.
+    """
     initialise, destroy = Node.__init__, Node.destroy_node
 
     @functools.wraps(initialise)
     def construct(self: Node, node_name: str, **options: Any) -> None:
-        with hooks.constructing(self, node_name, options) as (name, changed):
+        with constructing(self, node_name, options) as (name, changed):
             initialise(self, name, **changed)
 
     @functools.wraps(destroy)
     def destroy_node(self: Node) -> None:
-        hooks.node_removed(self)
+        if (hooks := hooks_of(self)) is not None:
+            hooks.close()
         destroy(self)
 
     wrapped: dict[str, Callable[..., Any]] = {
         "__init__": construct,
         "destroy_node": destroy_node,
-        "add_waitable": _noting_actions(Node.add_waitable, hooks),
-        **{name: _noting(getattr(Node, name), kind, hooks) for name, kind in _FACTORIES},
-        **{name: _forgetting(getattr(Node, name), hooks) for name in _REMOVERS},
+        "add_waitable": _noting_actions(Node.add_waitable, hooks_of),
     }
+    wrapped |= {name: _noting(getattr(Node, name), kind, hooks_of) for name, kind in _FACTORIES}
+    wrapped |= {name: _forgetting(getattr(Node, name), hooks_of) for name in _REMOVERS}
     before = {name: getattr(Node, name) for name in wrapped}
 
     def put(methods: Mapping[str, Callable[..., Any]]) -> None:
@@ -101,33 +112,37 @@ def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
     return functools.partial(put, before)
 
 
-def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
+def _noting(make: Callable[..., Any], kind: EndpointKind, hooks_of: HooksOf) -> Callable[..., Any]:
     names = _POSITIONAL.get(kind)
 
     @functools.wraps(make)
     def create(self: Node, *arguments: Any, **options: Any) -> Any:
+        hooks = hooks_of(self)
+        if hooks is None:
+            return make(self, *arguments, **options)
         entity = None
         if names is not None:
             given = {**dict(zip(names, arguments, strict=False)), **options}
-            entity = hooks.make_endpoint(self, kind, given)
+            entity = hooks.make(kind, given)
         if entity is None:
             entity = make(self, *arguments, **options)
-        hooks.endpoint_made(self, kind, entity)
+        hooks.made(kind, entity)
         return entity
 
     return create
 
 
-def _forgetting(destroy: Callable[..., Any], hooks: NodeHooks) -> Callable[..., Any]:
+def _forgetting(destroy: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:
     @functools.wraps(destroy)
     def remove(self: Node, entity: Any) -> Any:
-        hooks.endpoint_removed(self, entity)
+        if (hooks := hooks_of(self)) is not None:
+            hooks.removed(entity)
         return destroy(self, entity)
 
     return remove
 
 
-def _noting_actions(add: Callable[..., Any], hooks: NodeHooks) -> Callable[..., Any]:
+def _noting_actions(add: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:
     @functools.wraps(add)
     def add_waitable(self: Node, waitable: Any) -> None:
         add(self, waitable)
@@ -136,7 +151,8 @@ def _noting_actions(add: Callable[..., Any], hooks: NodeHooks) -> Callable[..., 
         if kind is None:
             return
         waitable.action_name = _action_name(self, kind, waitable)
-        hooks.endpoint_made(self, kind, waitable)
+        if (hooks := hooks_of(self)) is not None:
+            hooks.made(kind, waitable)
 
     return add_waitable
 

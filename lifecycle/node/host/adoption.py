@@ -1,21 +1,17 @@
-"""Make the nodes of the user's classes and functions, each as one planned node.
-
-They get the names, parameters, remaps and participants of the plan.
-"""
+"""Make the nodes of the user's classes and functions, each as one planned node."""
 
 from __future__ import annotations
 
 import contextlib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rclpy.context import Context
 from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import reach
 from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.prober import Prober
@@ -23,11 +19,10 @@ from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.graph_queries import OVER_DDS
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
-from lifecycle.node.author import parameters
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, load_nodes
 from lifecycle.node.host.foreign import ForeignNode
+from lifecycle.node.managed import Managed
+from lifecycle.node.node import LifecycleNode
+from lifecycle.node.planned import Construction, load_nodes, planned_options
 from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
@@ -42,9 +37,6 @@ class Participants:
 
     Nodes of equal transports, datagram size and connection URLs share. The first ones get the
     process's default context, which is what code that names none uses.
-
-    Args:
-        default: that context.
     """
 
     def __init__(self, default: Context) -> None:
@@ -54,11 +46,7 @@ class Participants:
 
     @contextlib.contextmanager
     def carrying(self, settings: ParticipantSettings) -> Iterator[Context]:
-        """Yield the context that a node is to be constructed on, inside the block.
-
-        Raises:
-            LifecycleError: its participant cannot be made as planned.
-        """
+        """Yield the context that a node is to be constructed on, inside the block."""
         context = self._made.get(settings)
         if context is not None:
             yield context
@@ -94,7 +82,6 @@ class Adoption:
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
-        participants: of the process.
         made: what stands for each node, by its key in the plan.
         unfollow: ends that nodes of this process are taken for those of the plan.
     """
@@ -117,17 +104,12 @@ class Adoption:
         self._constructed: dict[str, Node] = {}
         self._foreign: dict[int, ForeignNode] = {}
         self.made: dict[str, Hosted] = {}
-        self.unfollow = follow_nodes(self)
+        self.unfollow = follow_nodes(self.constructing, lambda node: self._foreign.get(id(node)))
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
     ) -> tuple[Hosted, ...]:
-        """Construct a planned node, and those of its group that the same call makes.
-
-        Args:
-            planned: the node that is to be made.
-            group: all that `what` may make, `planned` among them.
-            what: the class or function.
+        """Construct a planned node, and those of its group that the same class or function makes.
 
         Raises:
             LifecycleError: something else was made. What the class or function raises passes.
@@ -188,8 +170,6 @@ class Adoption:
                 hint="it must neither spin nor destroy them: the host does",
             )
 
-    # What rclpy's constructors and factories ask.
-
     @contextlib.contextmanager
     def constructing(
         self, node: Node, name: str, options: dict[str, Any]
@@ -204,7 +184,7 @@ class Adoption:
             yield name, options
             return
         refuse_unmanaged(planned, type(node))
-        options = parameters.planned_options(node, planned, options)
+        options = planned_options(node, planned, options)
         options["namespace"] = planned.namespace
         options["use_global_arguments"] = self._use_global_arguments
         if ours:
@@ -221,26 +201,6 @@ class Adoption:
             )
         self._constructed[planned.key] = node
 
-    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
-        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
-        foreign = self._foreign.get(id(node))
-        return None if foreign is None else foreign.make(kind, arguments)
-
-    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
-        """An endpoint of a node exists now."""
-        if foreign := self._foreign.get(id(node)):
-            foreign.made(kind, entity)
-
-    def endpoint_removed(self, node: Node, entity: Any) -> None:
-        """An endpoint of a node is about to be destroyed."""
-        if foreign := self._foreign.get(id(node)):
-            foreign.removed(entity)
-
-    def node_removed(self, node: Node) -> None:
-        """A node is about to be destroyed."""
-        if foreign := self._foreign.pop(id(node), None):
-            foreign.close()
-
     def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
         """Choose whose construction this is: by name among the group, else the one asked for."""
         full = f"/{(namespace or '').strip('/')}/{name}".replace("//", "/")
@@ -255,11 +215,7 @@ class Adoption:
 
 
 def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
-    """Import the class or function of one planned node.
-
-    Raises:
-        LifecycleError: it cannot be used as planned. What its module raises passes.
-    """
+    """Import the class or function of one planned node; raises LifecycleError."""
     found = load_nodes(planned.run.python, folders)
     if isinstance(found, type):
         refuse_unmanaged(planned, found)
@@ -267,11 +223,7 @@ def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., An
 
 
 def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
-    """Raise unless a class can be what the plan says.
-
-    Raises:
-        LifecycleError: it is to be managed, and knows nothing of that.
-    """
+    """Raise LifecycleError for a class that is to be managed, and knows nothing of that."""
     known = issubclass(node_class, LifecycleNode) or is_rclpy_managed(node_class)
     if planned.managed and not known:
         raise LifecycleError(

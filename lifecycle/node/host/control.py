@@ -166,8 +166,8 @@ class HostChannel:
     in order until it reads on, and of what is reported unasked only the newest.
 
     Attributes:
-        descriptors: of the busy sign, by which the host's executor is watched, beside the first
-            byte (SCM_RIGHTS, unix(7)); none if it is not watched.
+        descriptors: of the busy sign, beside the first byte (SCM_RIGHTS, unix(7)); none if the
+            host's executor is not watched.
     """
 
     def __init__(self, control: socket.socket) -> None:
@@ -263,10 +263,7 @@ def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
 
 
 def _of_user(trace: TracebackType | None) -> TracebackType | None:
-    """Return a traceback from the first frame on that is the user's; None if all are ours.
-
-    Ours, and those of the import system, are the same for every node that cannot be imported.
-    """
+    """Return a traceback from the first frame on that is the user's; None if all are ours."""
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
         if not file.startswith((_OURS, "<frozen importlib")) and file != importlib.__file__:

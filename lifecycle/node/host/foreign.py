@@ -8,7 +8,6 @@ answer, and its plain publishers are held until it is activated through the gate
 
 from __future__ import annotations
 
-import collections
 import functools
 import time
 from collections.abc import Callable, Mapping
@@ -17,15 +16,13 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import QoSPublisherEventType, QoSSubscriptionEventType
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind, Executor
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -36,18 +33,19 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
-from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
-from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.node_interface import serve_interface
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
-from lifecycle.node.lifecycle.machine import RefusedError
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
+from lifecycle.node.configuration import HostedState
+from lifecycle.node.connections import Connection, Connections
+from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
+from lifecycle.node.gate import CountedSubscription, HeldPublisher
+from lifecycle.node.machine import RefusedError
+from lifecycle.node.managed import NodeInHost
+from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
-    from lifecycle.node.endpoints.data_layer import DataLayer
+    from lifecycle.node.data_layer import DataLayer
     from lifecycle.node.host.loop import NodeLoop
 
 
@@ -64,81 +62,30 @@ _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
 
 
-class HeldPublisher(GatedPublisher):
-    """A publisher of a node that does not know of the gate.
-
-    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens:
-    such a node may publish once, in its constructor.
-    """
-
-    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
-        super().__init__(publisher, warn)
-        qos = publisher.qos_profile
-        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
-        depth = None if qos.history.name == "KEEP_ALL" else qos.depth or 1
-        self._kept: collections.deque[Any] = collections.deque(maxlen=depth)
-
-    def open(self) -> None:
-        """Publish as rclpy does, first what was kept."""
-        super().open()
-        while self._kept:
-            self._publisher.publish(self._kept.popleft())
-
-    def _drop(self, msg: object) -> None:
-        if self._keeps:
-            # As it is now: its author may change it later.
-            self._kept.append(msg if isinstance(msg, bytes) else serialize_message(msg))
-        elif not self._warned:
-            self._warned = True
-            self._warn(
-                f"the gate is closed: what is published on {self._publisher.topic!r} is dropped "
-                "until the system is verified"
-            )
-
-
-class ForeignNode:
+class ForeignNode(NodeInHost):
     """One hosted node of which the class is not ours; it offers the host what `Managed` does.
 
     Args:
         node: constructed by rclpy so far; its class's constructor may have more to do.
-        spec: what it was planned to be.
-        supervisor: name of the system whose gate holds it; empty for none.
         loop: runs its callbacks.
 
     Attributes:
-        node: rclpy's.
-        full_name: its name, fully qualified.
-        listeners: are called with it after every change of state, whatever caused it.
-        spec: what it was planned to be.
-        gate: holds back what it publishes, and counts what arrives.
-        configuration_changes: notifies of each change of its configuration.
         connections: its participants.
     """
 
     def __init__(self, node: Node, spec: PlannedNode, *, supervisor: str, loop: NodeLoop) -> None:
-        self.node = node
-        self.full_name = str(node.get_fully_qualified_name())
-        self.spec = spec
-        self._supervisor = supervisor
+        super().__init__(node, spec, supervisor, loop.call_beside, self.get_configuration)
         self._loop = loop
         self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
-        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self.connections = Connections(node, spec.participants)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
-        self.listeners: list[Callable[[Any], None]] = []
-        self._let_through = not supervisor
         self._is_spun = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
             self._machine = RclpyStateMachine(node, self)
-        self.configuration_changes = ConfigurationChanges(
-            loop.call_beside, self.get_configuration, failed=node.get_logger().error
-        )
-        self._found = Found(spec.at, self.configuration_changes.touch)
-        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
             self.gate.open()
         self._services = self._serve()
@@ -169,7 +116,7 @@ class ForeignNode:
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
-            self.gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
+            self.gate.add(entity, HeldPublisher(entity, self.log.warning))
         elif kind is EndpointKind.SUBSCRIPTION:
             self.gate.add(entity, CountedSubscription(entity, self.gate))
         unwatch: Callable[[], None] | None = None
@@ -179,7 +126,7 @@ class ForeignNode:
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
         connection = self._apart.pop(id(entity), self.connections.own)
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
-        endpoint = self._found.add(kind, placement)
+        endpoint = self.found.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
             follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
@@ -228,14 +175,7 @@ class ForeignNode:
         self._unspun.clear()
 
     def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
-        """Make a planned endpoint with a flow of its own, as its factory was asked for it.
-
-        Returns:
-            None for what rclpy is to make.
-
-        Raises:
-            LifecycleError: its participant or its flow cannot be made.
-        """
+        """Make a planned endpoint with a flow of its own; None for what rclpy is to make."""
         planned = self._planned(kind, given.get("topic"))
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
@@ -276,7 +216,7 @@ class ForeignNode:
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
         self.gate.remove(entity)
-        placement = self._found.remove(entity)
+        placement = self.found.remove(entity)
         if placement is None:
             return
         if placement.unwatch is not None:
@@ -286,8 +226,6 @@ class ForeignNode:
 
     def constructed(self) -> None:
         """Its class's constructor has returned: hold it, or have it spun."""
-        if self.spec.log_level:
-            self.node.get_logger().set_level(LoggingSeverity[self.spec.log_level.upper()])
         self._is_constructed = True
         if self._machine is not None:
             self._machine.complete()
@@ -300,7 +238,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in tuple(self._found.endpoints.values()):
+        for each in tuple(self.found.endpoints.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -315,11 +253,7 @@ class ForeignNode:
 
     @property
     def data_layer(self) -> DataLayer:
-        """What maps the endpoints of our nodes.
-
-        Raises:
-            LifecycleError: its own code makes its endpoints.
-        """
+        """What maps the endpoints of our nodes; raises LifecycleError, for it makes them itself."""
         raise LifecycleError(
             f"cannot move the endpoints of {self.full_name}: its class is not a "
             "lifecycle.LifecycleNode, and makes them itself",
@@ -328,9 +262,10 @@ class ForeignNode:
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for each in tuple(self._found.endpoints.values()):
+        for each in tuple(self.found.endpoints.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
+        self.found.endpoints.clear()  # rclpy is about to destroy them
         self._watching.drop_services(self._services)
         self.connections.close_all()
 
@@ -412,7 +347,7 @@ class ForeignNode:
 
     def complain(self, text: str) -> None:
         """Log it."""
-        self.node.get_logger().error(text)
+        self.log.error(text)
 
     def _release(self) -> None:
         self._let_through = True

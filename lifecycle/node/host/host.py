@@ -49,7 +49,6 @@ def preload(types: Iterable[str] = ()) -> None:
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
-    Call `gc.freeze()` after it to keep the imported pages shared.
 
     Args:
         types: interface types that nodes use besides; one that cannot be imported is left to the

@@ -30,6 +30,7 @@ from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import send_again_soon
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.control import leave_and_exit
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
 from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
 from lifecycle.node.host.control import (
     Command,
@@ -41,7 +42,6 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop, on_signal
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -62,19 +62,8 @@ def process_context(spec: HostSpec) -> Context:
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
-    {
-        Operation.ACTIVATE,
-        Operation.DEACTIVATE,
-        Operation.CLEANUP,
-        Operation.SHUTDOWN,
-    }
+    {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}
 )
-
-
-def is_marked(hosted: Hosted) -> bool:
-    """Whether the plan says what DSCP any endpoint of a node sends with."""
-    return any(each.dscp is not None for each in hosted.spec.endpoints)
-
 
 _LEAVE_S = 0.5
 """For the participants of nodes that were constructed while another's module is imported."""
@@ -108,7 +97,7 @@ class Host:
         self._measures = spec.measures
         self._nodes: dict[str, Hosted] = {}
         self._adoption = Adoption(context, self._loop, supervisor=spec.system)
-        self._marks: dict[str, tuple[int | None, ...]] = {}
+        self._marks: dict[str, tuple[int | None, ...]] = {}  # of whom the plan says any
 
     def run(self) -> NoReturn:
         """Construct, say ready, obey; never returns."""
@@ -186,6 +175,7 @@ class Host:
             if hosted.spec.managed:
                 hosted.listeners.append(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
+            self._note_marks(hosted)
             self._loop.add(hosted)
 
     async def _ready(self) -> None:
@@ -195,7 +185,7 @@ class Host:
         if self._spec.joins:
             self._adoption.participants.ask_others()
         self._channel.write(Event(kind="ready"))
-        if self._measures or any(is_marked(hosted) for hosted in self._nodes.values()):
+        if self._measures or self._marks:
             self._begin_to_look()
 
     def _begin_to_look(self) -> None:
@@ -216,28 +206,18 @@ class Host:
                     self._channel.write(Event(kind="measured", node=name, measured=measured))
 
     def _report_state(self, hosted: Hosted) -> None:
-        state = hosted.reported
-        self._channel.write(
-            Event(
-                kind="state",
-                node=hosted.full_name,
-                state=state.label,
-                connected=state.connected,
-            )
-        )
+        self._report("state", hosted, hosted.full_name)
 
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
-        if (hosted := self._nodes.get(configuration.name)) is not None:
-            self._note_marks(hosted)
-        self._channel.write(
-            Event(
-                kind="configuration",
-                node=configuration.name,
-                state=configuration.state,
-                connected=configuration.connected,
-                configuration=configuration,
-            )
-        )
+        hosted = self._nodes.get(configuration.name)
+        self._note_marks(hosted)
+        self._report("configuration", hosted, configuration.name, configuration=configuration)
+
+    def _report(self, kind: str, hosted: Hosted | None, name: str, **more: Any) -> None:
+        if hosted is not None:
+            state = hosted.reported
+            more.update(state=state.label, connected=state.connected)
+        self._channel.write(Event(kind=kind, node=name, **more))
 
     def _receive(self) -> bool:
         """Take what the supervisor sends; False once it has ended the channel."""
@@ -296,9 +276,9 @@ class Host:
 
     # What the supervisor asks for.
 
-    def _note_marks(self, node: Hosted) -> None:
-        """Take the DSCP of a node's sockets that is reported now."""
-        if is_marked(node):
+    def _note_marks(self, node: Hosted | None) -> None:
+        """Take the DSCP of a node's sockets that is reported now, if the plan has any of it."""
+        if node is not None and any(each.dscp is not None for each in node.spec.endpoints):
             self._marks[node.full_name] = node.connections.marks
 
     def _has_other_marks(self, node: Hosted) -> bool:
@@ -320,7 +300,7 @@ class Host:
                 error = result.error
                 if command.operation not in _ANSWERED_WITHOUT_CONFIGURATION or (
                     # No event reports its sockets: what its callback did to them is read now.
-                    command.operation is Operation.ACTIVATE and is_marked(node)
+                    command.operation is Operation.ACTIVATE and node.full_name in self._marks
                 ):
                     self._note_marks(node)
                     configuration = node.get_configuration()
@@ -329,19 +309,15 @@ class Host:
         except Exception as failure:  # noqa: BLE001 - each command is answered exactly once
             traceback.print_exc()
             result, error = None, f"{type(failure).__name__}: {failure}"
-        state = None if node is None else node.reported
-        self._channel.write(
-            Event(
-                kind="reply",
-                node=command.node,
-                id=command.id,
-                ok=result is not None and result.outcome is CallbackOutcome.SUCCESS,
-                state="" if state is None else state.label,
-                connected=state is not None and state.connected,
-                error=error,
-                configuration=configuration,
-                changed=changed,
-            )
+        self._report(
+            "reply",
+            node,
+            command.node,
+            id=command.id,
+            ok=result is not None and result.outcome is CallbackOutcome.SUCCESS,
+            error=error,
+            configuration=configuration,
+            changed=changed,
         )
 
     async def _carry_out(self, node: Hosted, command: Command) -> Result:
@@ -377,11 +353,7 @@ def _changed(node: Hosted) -> Result:
 
 
 class _Output:
-    """Standard output and error, which must not break with the supervisor that reads them.
-
-    Args:
-        log: see HostSpec.
-    """
+    """Standard output and error, which must not break with the supervisor that reads them."""
 
     def __init__(self, log: str) -> None:
         self._log = log

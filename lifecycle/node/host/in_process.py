@@ -1,7 +1,4 @@
-"""Run one node of a plan inside a test's own process, with a peer to exchange messages with.
-
-Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes these.
-"""
+"""Run one node of a plan inside a test's own process, with a peer to exchange messages with."""
 
 from __future__ import annotations
 
@@ -22,10 +19,10 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.conversions import import_interface, to_rclpy
+from lifecycle.node.callbacks import CallbackOutcome, Result
 from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
-from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 
 WAIT_S = 10.0
@@ -43,9 +40,8 @@ class NodeInProcess:
     """A node of a manifest in this process, spun by a thread until `close`.
 
     Any class or function of `run: {python: …}`: of rclpy.lifecycle too, or a plain node, which has
-    no states. One callback runs at a time, whatever `executor` says. Its methods may be called from
-    any thread but that one. An exception that a callback of the node raises is raised by whichever
-    of them is called next.
+    no states. Nothing is supervised or verified; one callback runs at a time. Its methods may be
+    called from any thread but that one, and the next one raises what a callback of the node raised.
 
     Args:
         planned: a node that is a Python class, or made by a function.
@@ -143,10 +139,8 @@ class NodeInProcess:
     def bring_to(self, state: str) -> None:
         """Bring an unconfigured node to "inactive" (connected) or "active", matched with its peer.
 
-        A plain node has no states: "active" is to be matched.
-
         Raises:
-            UsageError: no such state.
+            UsageError: no such state; a plain node has "active" alone, which is to be matched.
             BringUpError: a transition failed, or took longer than its deadline.
         """
         if state not in _WAYS:
@@ -196,8 +190,7 @@ class NodeInProcess:
     def run(self, function: Callable[[], Any], timeout_s: float = WAIT_S) -> Any:
         """Call a function, sync or async, in the thread that spins the node; return its result.
 
-        Raises:
-            TimeoutError: it is not done within `timeout_s` seconds.
+        Raises TimeoutError after `timeout_s` seconds, as all methods do that have it.
         """
         future: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
@@ -220,32 +213,20 @@ class NodeInProcess:
         self._declared(self._publishers, subscription, "subscription").publish(message)
 
     def received(self, publisher: str, timeout_s: float = WAIT_S) -> Any:
-        """Return the next message, in order, that the node published; by the declared name.
-
-        Raises:
-            TimeoutError: there is none within `timeout_s` seconds.
-        """
+        """Return the next message, in order, that the node published; by the declared name."""
         taken: list[Any] = self._declared(self._received, publisher, "publisher")
         self._wait(lambda: taken, f"cannot receive a message of {publisher!r}", timeout_s)
         return taken.pop(0)
 
     def call(self, service: str, request: Any, timeout_s: float = WAIT_S) -> Any:
-        """Call a declared service server, by its declared name; return the response.
-
-        Raises:
-            TimeoutError: there is none within `timeout_s` seconds.
-        """
+        """Call a declared service server, by its declared name; return the response."""
         client = self._declared(self._clients, service, "service server")
         future = client.call_async(request)
         self._wait(future.done, f"cannot get an answer of {service!r}", timeout_s)
         return future.result()
 
     def wait_for_log(self, text: str, timeout_s: float = WAIT_S) -> str:
-        """Return the first line that the node logged with `text` in it.
-
-        Raises:
-            TimeoutError: there is none within `timeout_s` seconds.
-        """
+        """Return the first line that the node logged with `text` in it."""
         self._wait(
             lambda: any(text in each for each in self.logs),
             f"cannot find {text!r} in what was logged",

@@ -1,12 +1,10 @@
 """Spin the nodes of one process, shut them down within a bound, and detect hanging callbacks.
 
-rclpy's own signal handlers are not used: they end the context while the nodes still need it, and
-nothing could be reported or done after that.
+rclpy's own signal handlers are not used: they end the context while the nodes still need it.
 
-An executor that waits is idle, whatever it waits for; a callback of a transition has a deadline of
-its own; everything else may take as long as the nodes' `silent_s`. What notices is at the other end
-of the busy sign (middleware/process/busy_sign.py): it need not be this process, whose interpreter
-may be locked by the very callback that hangs.
+A callback of a transition has a deadline of its own; everything else may take as long as the nodes'
+`silent_s`. What notices is at the other end of the busy sign (middleware/process/busy_sign.py): it
+need not be this process, whose interpreter may be locked by the very callback that hangs.
 """
 
 from __future__ import annotations
@@ -39,8 +37,8 @@ from lifecycle.middleware.process.busy_sign import BusySign, show_stacks_here
 from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import NodeExecutor, Watching, described, run
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.lifecycle.steps import hint
+from lifecycle.node.callbacks import hint
+from lifecycle.node.managed import Managed
 
 if TYPE_CHECKING:
     from lifecycle.node.host.adoption import Hosted
@@ -87,8 +85,7 @@ class Heartbeat:
     """Keeps the busy sign of an `events` or `multi` executor, by a timer of each node.
 
     It is in the node's default callback group: it comes late by as long as another callback of that
-    group takes, or as all threads are busy. Callbacks of other groups may take as long as they like
-    while a thread is left.
+    group takes, or as all threads are busy.
     """
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
@@ -171,8 +168,7 @@ class NodeLoop:
         context: of the executor; nodes may have others.
         sign: this process's busy sign; None where nobody looks at it.
         on_overlong: called with the seconds that a callback took beyond the limit of the sign.
-        executor: what runs the callbacks of nodes. One that is not `single` has a thread of its
-            own, or several.
+        executor: what runs the callbacks of nodes, if not `single` in threads of its own.
         threads: of a `multi` one; 0 is one for each processor, at least two.
 
     Attributes:
@@ -242,10 +238,7 @@ class NodeLoop:
         republish_names([*by_context.values(), *hidden_nodes()])
 
     def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
-        """Run a function, sync or async, where callbacks of nodes run; from any thread.
-
-        Once the process leaves, nothing runs any more.
-        """
+        """Run a function, sync or async, where callbacks of nodes run; from any thread."""
         with self._leaving:
             if not self._left:
                 self._own.create_task(task, *arguments)
@@ -258,8 +251,7 @@ class NodeLoop:
     def stop(self, reason: str, *, code: int) -> None:
         """Shut every node down and leave with `code`; from any thread, the first call counts.
 
-        Bounded: each node has its shutdown deadline. When a callback blocks the executor beyond
-        all of them, the process ends without it.
+        Each node has its shutdown deadline; if a callback blocks beyond all, the process just ends.
         """
         with self._lock:
             if self._stopping:
@@ -280,13 +272,10 @@ class NodeLoop:
         self.call_soon(self._shut_down, reason)
 
     def spin_and_exit(self, last: Callable[[], object] = lambda: None) -> None:
-        """Spin until stopped, then end the process; never returns.
+        """Spin until stopped, call `last`, then end the process; never returns.
 
         An exception in a message, service or timer callback ends the process, as in rclpy: its
         traceback is printed, then all nodes are shut down.
-
-        Args:
-            last: is called once no callback runs any more.
         """
         if self._own is not self._executor:
             spin = functools.partial(self._own.spin_once, _SPIN_S)
@@ -390,16 +379,15 @@ def on_signal(
     handler: Callable[[signal.Signals], None],
     beside: Mapping[int, Callable[[], bool]],
 ) -> Iterator[None]:
-    """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
+    """Call `handler` in a thread of its own for each SIGINT and SIGTERM; enter it in the main one.
+
+    A Python signal handler runs only when the main thread runs Python, and the main thread sits
+    in rcl's wait. The wake-up descriptor is written by the C handler, so a thread can read it.
 
     Args:
         handler: takes the signal.
         beside: descriptors that this thread reads, too: the function of each is called whenever it
             is readable, until it returns False.
-
-    A Python signal handler runs only when the main thread runs Python, and the main thread sits
-    in rcl's wait. The wake-up descriptor is written by the C handler, so a thread can read it.
-    Must be entered in the main thread.
     """
     receiver, sender = socket.socketpair()
     sender.setblocking(False)

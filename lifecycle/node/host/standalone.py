@@ -1,8 +1,7 @@
 """Run one node in a terminal, without a supervisor: with a manifest's part of a plan, or without.
 
-To a supervisor that attaches to it DDS asserts that its process runs; that its executor hangs is
-noticed by a thread of its own, which sleeps until then. A callback that also holds the lock of the
-interpreter keeps that thread from reporting, and only a supervisor of its own would see.
+A supervisor that attaches to it learns by DDS that its process runs, and from a thread of it that
+its executor hangs, unless a callback holds the lock of the interpreter.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue, brief
 from lifecycle.middleware.services.supervisor_topics import AliveNotice, AlivePublisher
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import is_auto
+from lifecycle.node.callbacks import CallbackOutcome
 from lifecycle.node.host.adoption import Adoption, Hosted
 from lifecycle.node.host.loop import NodeLoop, on_signal
-from lifecycle.node.lifecycle.steps import CallbackOutcome
+from lifecycle.node.managed import Managed
+from lifecycle.node.planned import is_auto
 from lifecycle.plan.model import PlannedNode
 
 _REPEATED_AFTER_S = (0.1, 0.3)
@@ -124,8 +123,7 @@ def run(
         domain_id: 0–232; None takes ROS_DOMAIN_ID, else 0.
         arguments: command line with --ros-args; None takes the process's own.
         say: called with each step; it prints to standard output.
-        interrupted: exit code after Ctrl-C; OK as for other ROS nodes, since launch calls a node
-            that exits otherwise died.
+        interrupted: exit code after Ctrl-C; of another than 0 launch says that the node died.
 
     Exit codes: 0 after SIGTERM, `interrupted` after Ctrl-C, 1 when a callback raised an exception,
     6 when the node could not be brought up.

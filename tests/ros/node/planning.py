@@ -12,10 +12,10 @@ from msgspec.structs import replace
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import plan_without_manifest
 from lifecycle.node.host.adoption import Adoption, Participants
 from lifecycle.node.host.loop import NodeLoop
+from lifecycle.node.node import LifecycleNode
+from lifecycle.node.planned import plan_without_manifest
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from tests.builders import STRING, planned_endpoint
 

@@ -13,7 +13,7 @@ from planning import built_with, planned, subscription
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, on_message
-from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
+from lifecycle.node.connections import ConnectionEvent, ConnectionEventKind
 
 UDP = "udpv4://127.0.0.1"
 

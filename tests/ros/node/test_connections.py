@@ -22,11 +22,15 @@ from lifecycle import LifecycleNode, codec, on_service
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionEventKind
-from lifecycle.node.connections.connections import ConnectError, UnknownConnectionError
-from lifecycle.node.endpoints import handover
-from lifecycle.node.endpoints.data_layer import NotConfiguredError
-from lifecycle.node.endpoints.endpoint import UnknownEndpointError
+from lifecycle.node import endpoint
+from lifecycle.node.connections import (
+    ConnectError,
+    ConnectionEvent,
+    ConnectionEventKind,
+    UnknownConnectionError,
+)
+from lifecycle.node.data_layer import NotConfiguredError
+from lifecycle.node.endpoint import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -52,7 +56,7 @@ class Everything(Hearing):
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is handed over has no peers that could end its patience."""
-    monkeypatch.setattr(handover, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(endpoint, "PATIENCE_S", 0.1)
 
 
 def configuration(driver: Driver) -> NodeConfiguration:

@@ -27,8 +27,8 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import ParameterDeclaration
 from lifecycle.manifest.qos import Durability, QosProfile
 from lifecycle.middleware.rcl.conversions import to_rclpy
-from lifecycle.node.endpoints.endpoint import UnknownEndpointError
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.endpoint import UnknownEndpointError
+from lifecycle.node.machine import NodeState
 from lifecycle.plan.model import PlannedNode
 
 Build = Callable[..., Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.endpoints.endpoint import UnknownEndpointError, find_endpoint
+from lifecycle.node.endpoint import UnknownEndpointError, find_endpoint
 
 VIDEO = (EndpointKind.PUBLISHER, "video")
 COMMAND = (EndpointKind.SUBSCRIPTION, "/robot/command")

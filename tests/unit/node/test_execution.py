@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import LifecycleError
-from lifecycle.node.lifecycle.steps import (
+from lifecycle.node.callbacks import (
     CallbackOutcome,
     DeadlineError,
     Result,

@@ -15,9 +15,9 @@ pytest.importorskip("rclpy")
 
 from lifecycle.manifest.model import Timeouts
 from lifecycle.middleware.rcl.rclpy_nodes import RCLError
+from lifecycle.node.gate import NodeGate
 from lifecycle.node.host.foreign import ForeignNode
-from lifecycle.node.lifecycle.gate import NodeGate
-from lifecycle.node.lifecycle.machine import RefusedError
+from lifecycle.node.machine import RefusedError
 
 
 class Returned(enum.Enum):

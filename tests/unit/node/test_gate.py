@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
+from lifecycle.node.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
 
 INFO = {"source_timestamp": 0, "received_timestamp": 0, "publication_sequence_number": 1}
 

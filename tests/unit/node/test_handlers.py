@@ -6,7 +6,7 @@ import pytest
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.author.handlers import (
+from lifecycle.node.handlers import (
     match,
     on_action,
     on_message,

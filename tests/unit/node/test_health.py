@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from lifecycle.manifest.model import Health
-from lifecycle.node.lifecycle import health
-from lifecycle.node.lifecycle.health import HealthCheck
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node import callbacks
+from lifecycle.node.callbacks import HealthCheck
+from lifecycle.node.machine import NodeState
 from lifecycle.verify.observation import HealthReport
 
 OK = HealthReport(ok=True)
@@ -26,14 +27,15 @@ class Bench:
         self.ticks: list[Callable[[], None]] = []
         self.changes: list[HealthReport | None] = []
         self.traces: list[str] = []
-        monkeypatch.setattr(health.time, "monotonic", lambda: self.now_s)
-        self.check = HealthCheck(
-            check,
-            self,  # type: ignore[arg-type]
-            Health(check=True, interval_s=2.0, timeout_s=3.0),
-            changed=lambda: self.changes.append(self.check.report),
-            failed=self.traces.append,
+        monkeypatch.setattr(callbacks.time, "monotonic", lambda: self.now_s)
+        touch = lambda: self.changes.append(self.check.report)  # noqa: E731
+        managed: Any = SimpleNamespace(
+            turns=self,
+            spec=SimpleNamespace(health=Health(check=True, interval_s=2.0, timeout_s=3.0)),
+            configuration_changes=SimpleNamespace(touch=touch),
+            log=SimpleNamespace(error=self.traces.append),
         )
+        self.check = HealthCheck(managed, check)
 
     # What it asks of its turns.
 

@@ -9,7 +9,7 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import ConfigurationChanges
-from lifecycle.node.connections.connection_status import (
+from lifecycle.node.connections import (
     ConnectionEvent,
     ConnectionEventKind,
     ConnectionEvents,

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lifecycle.node.host.loop import Watchdog
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.machine import NodeState
 
 
 class Sign:

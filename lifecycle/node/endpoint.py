@@ -1,4 +1,4 @@
-"""One endpoint of a node: what it is, how code wants it made, and where it is now.
+"""One endpoint of a node: what it is, how code wants it made, where it is now, and its handover.
 
 rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
@@ -17,11 +17,12 @@ from rclpy.event_handler import (
     UnsupportedEventTypeError,
 )
 from rclpy.publisher import Publisher
+from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.author.handlers import Key
-from lifecycle.node.connections.connections import Connection
+from lifecycle.node.connections import Connection
+from lifecycle.node.handlers import Key
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
-    from lifecycle.node.endpoints.handover import Handover
-    from lifecycle.node.endpoints.publisher import DeclaredPublisher
+    from lifecycle.node.gate import DeclaredPublisher
+    from lifecycle.node.services import Turns
 
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
@@ -41,12 +42,7 @@ class UnknownEndpointError(LifecycleError, KeyError):
 
 
 def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
-    """Return the endpoint that a spelling means.
-
-    Args:
-        spelling: `publishers/video`, or the declared name alone where no other kind has it.
-        declared: every declared endpoint.
-        node: fully qualified node name, for messages.
+    """Return the endpoint that `publishers/video` means, or `video` if one kind of `node` has it.
 
     Raises:
         UnknownEndpointError: it means none, or more than one.
@@ -107,7 +103,7 @@ def watch_matches(
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
-        entity: what to watch.
+        entity: the endpoint.
         group: reentrant.
         changed: is called.
 
@@ -178,8 +174,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
         error: why it could not be made as asked; empty if it was.
         fault: what its handler raised at the last goal of an action; empty if it returned.
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
-        lossy: the author's hint: the data bear an unreliable transport; None without one.
-        size_bytes: the author's hint: its largest serialized message; None without one.
+        lossy, size_bytes: the author's hints for negotiation; None without one.
         options: how it is made, as far as code says it by `set_options`.
     """
 
@@ -236,11 +231,7 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
 
 
 def interface_name(interface: type[Any]) -> str:
-    """Return `package/msg/Type` of a generated class.
-
-    Raises:
-        LifecycleError: not a generated message, service or action class.
-    """
+    """Return `package/msg/Type` of a generated class; raises LifecycleError for another."""
     package, _, rest = interface.__module__.partition(".")
     kind = rest.partition(".")[0]
     if kind not in {"msg", "srv", "action"}:
@@ -249,3 +240,56 @@ def interface_name(interface: type[Any]) -> str:
             "give a message, service or action class such as std_msgs.msg.String"
         )
     return f"{package}/{kind}/{interface.__name__}"
+
+
+SETTLE_S = 0.25
+"""The old one lives on after the new one has matched as many peers as it had."""
+
+PATIENCE_S = 4.0
+"""Both live at most so long, if the new one never matches as many.
+
+A participant that others have not noticed at once is announced again after 3 s.
+"""
+
+
+class Handover:
+    """The time in which an endpoint is on two connections: make before break.
+
+    Both ends of a flow learn of each other at different moments, so a match seen here does not
+    prove that the other side has seen it: the old one stays a little longer than that. Meanwhile a
+    publisher publishes by the old one, and a subscription receives by both.
+
+    Args:
+        old: where it is until then.
+        peers_before: how many peers it had there.
+        finish: destroys the old one; called exactly once.
+
+    Attributes:
+        done: the old one is destroyed.
+    """
+
+    def __init__(
+        self, old: Placement, peers_before: int, turns: Turns, finish: Callable[[], None]
+    ) -> None:
+        self.old = old
+        self.done: Future = Future()
+        self._peers_before = peers_before
+        self._turns = turns
+        self._finish = finish
+        self._settles = False
+        self._call_off = turns.call_after(PATIENCE_S, self.end)
+
+    def peers_changed(self, peers: int) -> None:
+        """The new one has so many peers now."""
+        if peers >= self._peers_before and not self._settles and not self.done.done():
+            self._settles = True
+            self._call_off()
+            self._call_off = self._turns.call_after(SETTLE_S, self.end)
+
+    def end(self) -> None:
+        """Break now; again is harmless."""
+        if self.done.done():
+            return
+        self._call_off()
+        self.done.set_result(None)
+        self._finish()

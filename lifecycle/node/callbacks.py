@@ -1,4 +1,4 @@
-"""Run the author's callbacks, sync or async, inside rclpy's executor.
+"""Run the author's callbacks, sync or async, inside rclpy's executor: of transitions, and `health`.
 
 An `async def` callback that exceeds its deadline gets `DeadlineError` thrown in, so that its
 traceback shows what it was waiting for. A sync callback cannot be interrupted in Python: it is
@@ -13,11 +13,17 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import Health
+from lifecycle.verify.observation import HealthReport
+
+if TYPE_CHECKING:
+    from lifecycle.node.machine import NodeState
+    from lifecycle.node.managed import Managed
 
 
 class CallbackOutcome(enum.Enum):
@@ -53,8 +59,7 @@ _RCLPY_TYPE = "TransitionCallbackReturnType"
 class Running:
     """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
 
-    rclpy has no running asyncio loop: an awaiting task is resumed each time its executor wakes, so
-    whoever interrupts it has to wake the executor.
+    An awaiting task is resumed each time that the executor wakes: who interrupts it has to wake it.
 
     Attributes:
         returned: what it returned.
@@ -171,10 +176,7 @@ def _raised(error: Exception, trace: str, *, what: str) -> Result:
 
 
 def error_text(error: Exception) -> str:
-    """Return what was raised in one line, and what to do about it where the text does not say it.
-
-    asyncio says `no running event loop` of whatever is awaited of it, `asyncio.sleep` first of all.
-    """
+    """Return what was raised in one line, and what to do about it."""
     todo = hint(error)
     return f"{type(error).__name__}: {error}" + (f"; {todo}" if todo else "")
 
@@ -190,10 +192,9 @@ def hint(error: Exception) -> str:
 
 
 def judge(returned: object, *, what: str) -> Result:
-    """Turn a callback's return value into a Result.
+    """Turn a callback's return value into a Result; what is none is an ERROR.
 
-    None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name, so that this needs no
-    rclpy. Anything else is an ERROR, also where rclpy would break.
+    None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name.
     """
     name = "SUCCESS" if returned is None else getattr(returned, "name", "")
     known = (
@@ -223,3 +224,95 @@ def positional_count(callback: Callable[..., Any], available: int) -> int:
         inspect.Parameter.POSITIONAL_OR_KEYWORD,
     }
     return min(available, sum(kind in positional for kind in kinds))
+
+
+_LONGEST = 200
+"""Characters of an answer that are passed on."""
+
+
+class HealthCheck:
+    """Asks one node how it is: once connected, at each change of its state, and at an interval.
+
+    Args:
+        managed: the node, whose configuration has changed with each other `report`.
+        check: returns None, True or "" if all is well, else what is wrong; may be async.
+
+    Attributes:
+        report: the last answer; None while the node is not connected.
+    """
+
+    def __init__(self, managed: Managed, check: Callable[[], Any]) -> None:
+        self._managed = managed
+        self._check = check
+        self._how = managed.spec.health or Health()
+        self._end: Callable[[], None] | None = None
+        self._asked_s: float | None = None
+        self._round = 0
+        self._is_stale = False
+        self.report: HealthReport | None = None
+
+    def follow(self, state: NodeState) -> None:
+        """Begin to ask, ask again or stop, as the node's new state says."""
+        if not state.steady:
+            return
+        self._asked_s = None  # what it says of the state before counts no more
+        self._round += 1
+        if not state.connected:
+            if self._end is not None:
+                self._end()
+            self._end = self.report = None
+            return
+        if self._end is None:
+            self._end = self._managed.turns.call_every(self._how.interval_s, self._ask)
+        self._is_stale = True
+        self._ask()
+
+    def _ask(self) -> None:
+        if self._asked_s is not None:
+            waited_s = time.monotonic() - self._asked_s
+            if waited_s >= self._how.timeout_s:
+                late = f"it has not answered within {self._how.timeout_s:g} s"
+                self._take(HealthReport(ok=None, message=late))
+            return
+        try:
+            answer = self._check()
+        except Exception as error:  # noqa: BLE001 - the user's code: reported
+            self._take(self._raised(error))
+            return
+        if not inspect.isawaitable(answer):
+            self._take(_report(answer))
+            return
+        self._asked_s = time.monotonic()
+        if self._is_stale:
+            self._take(HealthReport(ok=None, message="it has not answered since its state changed"))
+        round_ = self._round
+
+        async def wait() -> None:
+            try:
+                report = _report(await answer)
+            except Exception as error:  # noqa: BLE001 - the user's code: reported
+                report = self._raised(error)
+            if round_ == self._round:
+                self._asked_s = None
+                self._take(report)
+
+        self._managed.turns.call_soon(wait)
+
+    def _raised(self, error: Exception) -> HealthReport:
+        said = f"it raised {type(error).__name__}: {error}"[:_LONGEST]
+        if self.report is None or self.report.message != said:
+            self._managed.log.error("".join(traceback.format_exception(error)))
+        return HealthReport(ok=False, message=said)
+
+    def _take(self, report: HealthReport) -> None:
+        is_stale, self._is_stale = self._is_stale, False
+        if is_stale or report != self.report:
+            self.report = report
+            self._managed.configuration_changes.touch()
+
+
+def _report(answer: object) -> HealthReport:
+    if answer is None or answer is True or answer == "":
+        return HealthReport(ok=True)
+    said = "it is not" if answer is False else str(answer)
+    return HealthReport(ok=False, message=said[:_LONGEST])

@@ -1,12 +1,9 @@
 """The data layer of a node: what it declares, and which connection each of it is mapped onto.
 
-One implementation behind the local API, the ROS services (node_interface.py) and the control
-channel.
-
 *configure* imports what is declared, *connect* maps what is not mapped yet onto the connection
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
-`disconnect` and `remap` change single ones. See *Topological Discovery and Communication
-Negotiation*, "Node Interface".
+`disconnect` and `remap` change single ones, asked by the node's code, by a ROS service or by the
+control channel: "Node Interface" of *Topological Discovery and Communication Negotiation*.
 """
 
 from __future__ import annotations
@@ -22,11 +19,11 @@ from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.conversions import import_interface
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.node.author.handlers import Key, alternatives, needs_handler
-from lifecycle.node.connections.connections import ConnectError, Connection, Connections
-from lifecycle.node.endpoints.endpoint import (
+from lifecycle.node.connections import ConnectError, Connection, Connections
+from lifecycle.node.endpoint import (
     CLIENTS,
     Endpoint,
+    Handover,
     Placement,
     UnknownEndpointError,
     count_peers,
@@ -34,14 +31,14 @@ from lifecycle.node.endpoints.endpoint import (
     refuse_unfit,
     watch_matches,
 )
-from lifecycle.node.endpoints.handover import Handover
-from lifecycle.node.endpoints.making import Maker
-from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
-from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.node.gate import DeclaredPublisher, Kept
+from lifecycle.node.handlers import Key, alternatives, needs_handler
+from lifecycle.node.machine import NodeState
+from lifecycle.node.making import Maker
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
-    from lifecycle.node.author.managed import Managed
+    from lifecycle.node.managed import Managed
 
 _CONFIGURED = frozenset(
     {
@@ -75,9 +72,6 @@ class NotConfiguredError(LifecycleError):
 class DataLayer:
     """Declared endpoints of one node and their mapping onto connections.
 
-    Args:
-        managed: the node; its gate holds back publishers and subscriptions.
-
     Attributes:
         endpoints: from configure to cleanup every declared endpoint, in the order of declaration.
         connections: what endpoints may be mapped onto.
@@ -105,10 +99,6 @@ class DataLayer:
 
         What a manifest says of the same name is kept. The same line may declare the same again:
         on_activate runs more than once.
-
-        Args:
-            planned: with the place where it is declared.
-            callback: its handler, beside the decorated methods.
 
         Raises:
             LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
@@ -171,12 +161,7 @@ class DataLayer:
         self._changed()
 
     def set_options(self, spelling: str, options: dict[str, Any]) -> None:
-        """Keep how an endpoint is to be made.
-
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
-            LifecycleError: it exists already, or its kind cannot have them.
-        """
+        """Keep how an endpoint is to be made: LifecycleNode.set_options."""
         endpoint = self.find(spelling)
         refuse_unfit(endpoint.kind, options)
         if endpoint.placement is not None:
@@ -187,41 +172,13 @@ class DataLayer:
         endpoint.options = options
 
     def find(self, spelling: str) -> Endpoint:
-        """Return the endpoint `video`, or `publishers/video`.
-
-        Raises:
-            UnknownEndpointError: none, or more than one, is called so.
-        """
+        """Return the endpoint `video`, or `publishers/video`; raises UnknownEndpointError."""
         is_early = self._managed.state is NodeState.UNCONFIGURED
         declared = self._declared if is_early else self.endpoints
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
-    def publisher(self, name: str) -> DeclaredPublisher:
-        """Return the handle of a declared publisher.
-
-        Raises:
-            UnknownEndpointError: no such declaration.
-        """
-        handle = self._find(EndpointKind.PUBLISHER, name).handle
-        assert handle is not None
-        return handle
-
-    def entity(self, kind: EndpointKind, name: str) -> Any:
-        """Return the rclpy object of a declared endpoint.
-
-        Raises:
-            UnknownEndpointError: no such declaration.
-            LifecycleError: the node is not connected.
-        """
-        entity = self._find(kind, name).entity
-        if entity is None:
-            raise LifecycleError(
-                f"cannot use {kind.noun} {name!r}: {self._name} is not connected; "
-                "endpoints exist from connect until disconnect"
-            )
-        return entity
-
-    def _find(self, kind: EndpointKind, name: str) -> Endpoint:
+    def declared(self, kind: EndpointKind, name: str) -> Endpoint:
+        """Return a declared endpoint; raises UnknownEndpointError."""
         endpoint = self.endpoints.get((kind, name))
         if endpoint is not None:
             return endpoint
@@ -230,6 +187,16 @@ class DataLayer:
         else:
             hint = alternatives(name, [n for k, n in self.endpoints if k is kind])
         raise UnknownEndpointError(f"cannot find {kind.noun} {name!r} of {self._name}", hint=hint)
+
+    def entity(self, kind: EndpointKind, name: str) -> Any:
+        """Return the rclpy object of a declared endpoint: LifecycleNode.client."""
+        entity = self.declared(kind, name).entity
+        if entity is None:
+            raise LifecycleError(
+                f"cannot use {kind.noun} {name!r}: {self._name} is not connected; "
+                "endpoints exist from connect until disconnect"
+            )
+        return entity
 
     # The transitions.
 
@@ -276,7 +243,7 @@ class DataLayer:
         endpoint.handler = handler
         self.endpoints[endpoint.key] = endpoint
         if planned.kind is EndpointKind.PUBLISHER:
-            warn = self._node.get_logger().warning
+            warn = self._managed.log.warning
             endpoint.handle = DeclaredPublisher(planned.name, warn, Kept.of(planned.qos))
             self._gate.add(endpoint.handle, endpoint.handle)
         self._changed()
@@ -290,11 +257,9 @@ class DataLayer:
     def make(self) -> None:
         """Map every endpoint that is mapped nowhere onto what the plan says, or none.
 
-        Under an authority nothing is mapped here: it must have been done.
-
         Raises:
-            ConnectError: the first endpoint that could not be made, with the RMW's reason; or all
-                that are not mapped.
+            ConnectError: the first endpoint that could not be made, with the RMW's reason; under an
+                authority, which maps them all, those that are not mapped.
         """
         for endpoint in self.endpoints.values():
             endpoint.error = ""
@@ -546,10 +511,7 @@ class DataLayer:
         self.connections.close_unused(used)
 
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
-        """Keep a strictly unique publisher alone: a participant's publishers share its sockets.
-
-        On the node's own participant the RMW refuses such a publisher itself.
-        """
+        """Keep a strictly unique publisher alone: a participant's publishers share its sockets."""
         publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
         if connection.participant is None or endpoint.kind is not publisher:
             return

@@ -1,9 +1,11 @@
 """The gate: publishers, subscriptions and timers work only while their node is active.
 
-A gate swaps a method instead of asking a
-question: while the node is active `publisher.publish` *is* rclpy's own method, so an open gate
-costs nothing per call, and a closed one less than any publish. Entities that tools rely on
+A gate swaps a method instead of asking a question: while the node is active `publisher.publish`
+*is* rclpy's own method, so an open gate costs nothing per call. Entities that tools rely on
 (`/rosout`, `/parameter_events`, `~/transition_event`, `/clock`) never pass through here.
+
+The handle of a declared publisher is gated too. It exists from configure until cleanup; the rclpy
+publisher behind it is made by connect and destroyed by disconnect.
 """
 
 from __future__ import annotations
@@ -15,10 +17,12 @@ from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle.errors import LifecycleError
+from lifecycle.manifest.qos import Durability, History, QosProfile
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.sample import Measured, Sample
 
 if TYPE_CHECKING:
+    from rclpy.duration import Duration
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
@@ -45,11 +49,8 @@ class Gated(Protocol):
 class NodeGate:
     """All gated entities of one node; closed until the node is active.
 
-    Args:
-        counts: callbacks of subscriptions get message info, as `executor: events` has it not.
-
     Attributes:
-        counts: as given.
+        counts: callbacks of subscriptions get message info, as `executor: events` has it not.
         is_open: data may flow.
         apart: topics that are published by another host's clock.
     """
@@ -117,6 +118,11 @@ class NodeGate:
 class GatedPublisher:
     """Drops what is published while closed; says so once per inactive period."""
 
+    _warning = (
+        "cannot publish on {!r}: the node is not active, so the message is dropped, and so are "
+        "those that follow until it is active"
+    )
+
     def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
         self._publisher = publisher
         self._warn = warn
@@ -134,17 +140,45 @@ class GatedPublisher:
     def _drop(self, msg: object) -> None:  # noqa: ARG002 - the signature of Publisher.publish
         if not self._warned:
             self._warned = True
-            self._warn(
-                f"cannot publish on {self._publisher.topic!r}: the node is not active, so the "
-                "message is dropped, and so are those that follow until it is active"
-            )
+            self._warn(self._warning.format(self._publisher.topic))
+
+
+class HeldPublisher(GatedPublisher):
+    """A publisher of a node that does not know of the gate, and may publish in its constructor.
+
+    What TRANSIENT_LOCAL would keep for late subscriptions is kept, and sent once the gate opens.
+    """
+
+    _warning = (
+        "the gate is closed: what is published on {!r} is dropped until the system is verified"
+    )
+
+    def __init__(self, publisher: Publisher, warn: Callable[[str], None]) -> None:
+        super().__init__(publisher, warn)
+        qos = publisher.qos_profile
+        self._kept: Kept | None = None
+        if qos.durability.name == "TRANSIENT_LOCAL":
+            self._kept = Kept(None if qos.history.name == "KEEP_ALL" else qos.depth or 1)
+
+    def open(self) -> None:
+        """Publish as rclpy does, first what was kept."""
+        super().open()
+        if self._kept is not None:
+            self._kept.send_again(self._publisher)
+            self._kept.forget()
+
+    def _drop(self, msg: object) -> None:
+        if self._kept is None:
+            super()._drop(msg)
+        else:
+            self._kept.add(msg)
 
 
 class CountedSubscription:
     """Counts what arrives while open: `lifecycle.measure`. Closed it leaves messages alone.
 
-    rclpy decides by the callback's signature, once per message, whether to pass the message info. A
-    callback of ours takes it always, so that a swap between take and call changes nothing.
+    A callback of ours takes message info always: rclpy decides that for each message before the
+    gate may swap the callback.
 
     Raises:
         LifecycleError: its callback takes message info, and its node's gate counts nothing.
@@ -189,8 +223,8 @@ class CountedSubscription:
 class GatedSubscription(CountedSubscription):
     """Takes and drops messages while closed, so that old ones do not wait for activation.
 
-    A TRANSIENT_LOCAL sample is state, not an event: its publisher, activated before us, sends it
-    once. So the last `depth` of those are kept while closed and given to the callback when opened.
+    A TRANSIENT_LOCAL sample is state, not an event, and sent once. So the last `depth` of those are
+    kept while closed and given to the callback when opened.
     """
 
     def __init__(self, subscription: Subscription, gate: NodeGate, later: Later) -> None:
@@ -258,10 +292,7 @@ def counting(call: Callable[[Any, Info], Any], counter: Counter) -> Callable[[An
 
 
 class GatedTimer:
-    """Runs while open unless the user cancelled it; calls to cancel and reset keep their meaning.
-
-    A timer starts its period anew when the node becomes active.
-    """
+    """Runs while open, from then on, unless the user cancelled it; reset keeps its meaning."""
 
     def __init__(self, timer: Timer, *, wanted: bool) -> None:
         self._timer = timer
@@ -300,3 +331,173 @@ def _takes_one(callback: Callable[..., Any]) -> bool:
     except TypeError:
         return False
     return True
+
+
+_SYSTEM_DEFAULT_DEPTH = 1
+"""Fast DDS 2.14's own, for a profile that leaves history to the middleware."""
+
+
+class Kept:
+    """The last messages of one publisher, serialized: its TRANSIENT_LOCAL history.
+
+    DDS keeps it in the writer, and each connection has a writer of its own (DDS 1.4, 2.2.3.4).
+
+    Args:
+        depth: how many, > 0; None for all.
+        lifespan_ns: older ones are not worth anything any more; None for ever.
+    """
+
+    def __init__(self, depth: int | None, lifespan_ns: int | None = None) -> None:
+        self._samples: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
+        self._lifespan_ns = lifespan_ns
+
+    @classmethod
+    def of(cls, qos: QosProfile | None) -> Kept | None:
+        """Return what keeps for a publisher of this QoS; None where nothing, or all, is kept."""
+        if qos is None or qos.durability is not Durability.TRANSIENT_LOCAL:
+            return None
+        if qos.history is History.KEEP_ALL:
+            return None
+        depth = qos.depth if qos.history is History.KEEP_LAST else 0
+        return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
+
+    def add(self, msg: Any) -> None:
+        """Keep a message, or serialized bytes, as it is now: its author may change it later."""
+        from rclpy.serialization import serialize_message
+
+        data = msg if isinstance(msg, bytes) else serialize_message(msg)
+        self._samples.append((time.monotonic_ns(), data))
+
+    def send_again(self, publisher: Publisher) -> None:
+        """Publish what is kept by another publisher."""
+        oldest_ns = 0
+        if self._lifespan_ns:
+            oldest_ns = time.monotonic_ns() - self._lifespan_ns
+        for said_ns, data in self._samples:
+            if said_ns >= oldest_ns:
+                publisher.publish(data)
+
+    def forget(self) -> None:
+        """Nothing was said."""
+        self._samples.clear()
+
+
+class DeclaredPublisher:
+    """Publishes on a declared topic while the node is active; drops otherwise.
+
+    While the node is active `publish` is rclpy's own bound method. Only a TRANSIENT_LOCAL publisher
+    keeps what it sends, to take it along to another connection.
+
+    Example:
+        >>> @on_timer(period_s=0.05)
+        ... def tick(self):
+        ...     self.publisher("video").publish(self.camera.read())
+
+    Attributes:
+        name: as declared.
+        publish: takes a message of the declared type, or serialized bytes.
+    """
+
+    publish: Callable[[Any], None]
+
+    def __init__(self, name: str, warn: Callable[[str], None], kept: Kept | None = None) -> None:
+        self.name = name
+        self._warn = warn
+        self._kept = kept
+        self._warned = False
+        self._is_open = False
+        self._entity: Publisher | None = None
+        self._owes = False  # it has not sent what is kept
+        self.publish = self._drop
+
+    @property
+    def entity(self) -> Publisher:
+        """The rclpy publisher, for everything beside `publish`.
+
+        Raises:
+            LifecycleError: the node is not connected.
+        """
+        if self._entity is None:
+            raise LifecycleError(
+                f"cannot reach publisher {self.name!r}: the node is not connected; "
+                "endpoints exist from connect until disconnect"
+            )
+        return self._entity
+
+    def get_subscription_count(self) -> int:
+        """Return how many subscriptions are matched; 0 while not connected."""
+        return self._entity.get_subscription_count() if self._entity is not None else 0
+
+    @property
+    def topic_name(self) -> str:
+        """Fully qualified; empty while not connected."""
+        return str(self._entity.topic_name) if self._entity is not None else ""
+
+    def assert_liveliness(self) -> None:
+        """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""
+        if self._entity is not None:
+            self._entity.assert_liveliness()
+
+    def wait_for_all_acked(self, timeout: Duration | None = None) -> bool:
+        """Return whether all that was published is acknowledged, at the latest after `timeout`.
+
+        It blocks; None waits for ever. Nothing is awaited while not connected.
+        """
+        if self._entity is None:
+            return True
+        return bool(self._entity.wait_for_all_acked(*(() if timeout is None else (timeout,))))
+
+    def attach(self, entity: Publisher) -> None:
+        """Publish by `entity` from now on; it is another one than before."""
+        self._entity = entity
+        self._owes = True
+        self._warned = False
+        if self._is_open:
+            self.open()
+
+    def detach(self) -> None:
+        """The rclpy publisher is being destroyed."""
+        self._entity = None
+        self.publish = self._drop
+
+    def forget(self) -> None:
+        """Later subscriptions do not receive what was sent so far."""
+        if self._kept is not None:
+            self._kept.forget()
+
+    def open(self) -> None:
+        """Let `publish` be rclpy's own method, as far as there is one."""
+        self._is_open = True
+        self._warned = False
+        if self._entity is None:
+            return
+        if self._kept is None:
+            self.publish = self._entity.publish
+            return
+        if self._owes:
+            self._owes = False
+            self._kept.send_again(self._entity)
+        self.publish = self._publish_and_keep
+
+    def close(self) -> None:
+        """Drop what is published; say so once until the gate has been open again."""
+        self._is_open = False
+        self._warned = False
+        self.publish = self._drop
+
+    def _publish_and_keep(self, msg: Any) -> None:
+        assert self._entity is not None
+        assert self._kept is not None
+        self._entity.publish(msg)  # refuses what is of another type
+        self._kept.add(msg)
+
+    def _drop(self, msg: Any) -> None:  # noqa: ARG002 - the signature of Publisher.publish
+        if not self._warned:
+            self._warned = True
+            why, until = "the node is not active", "active"
+            if self._is_open:
+                why, until = "it is mapped onto no connection", "mapped onto one"
+            self._warn(
+                f"cannot publish on {self.name!r}: {why}, so the message is dropped, and so are "
+                f"those that follow until it is {until}"
+            )

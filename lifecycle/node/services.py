@@ -1,29 +1,41 @@
-"""The five lifecycle_msgs services and `~/transition_event` of a managed node, and its own timers.
+"""The services of a node and its own timers; none of it passes the gate.
 
-None of it passes the gate: services, and `Turns`, work in every state.
+Those of lifecycle_msgs and `~/transition_event` have rcl_lifecycle's names, types and QoS
+(rcl_lifecycle/src/com_interface.c). A request that the state does not allow is answered with
+success=False; it never raises.
 
-Names, types and QoS are rcl_lifecycle's (rcl_lifecycle/src/com_interface.c). A request that the
-state does not allow is answered with success=False; it never raises.
+A request of the node interface (connect_to, map_to, disconnect, remap) is a list of names and
+values, the answer says of each whether it succeeded and why not:
+
+    ros2 service call /camera/connect_to rcl_interfaces/srv/SetParameters \
+        "{parameters: [{name: net, value: {type: 4, string_value: 'udpv4://10.77.0.1:7911'}}]}"
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Coroutine, Iterable
+import traceback
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs import msg, srv
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from lifecycle.node.lifecycle import machine
-from lifecycle.node.lifecycle.machine import Machine, RefusedError
-from lifecycle.node.lifecycle.steps import CallbackOutcome
+from lifecycle.errors import LifecycleError
+from lifecycle.node import machine
+from lifecycle.node.callbacks import CallbackOutcome
+from lifecycle.node.connections import connections_of
+from lifecycle.node.machine import Machine, RefusedError
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+
+    from lifecycle.node.data_layer import DataLayer
 
 
 _TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
@@ -34,10 +46,7 @@ def serve(
 ) -> Callable[[machine.Transition], None]:
     """Serve a node's state machine; returns what publishes a transition event.
 
-    Args:
-        node: the node to be seen as managed.
-        state_machine: its state machine.
-        group: must be reentrant, so that others can ask while a transition runs.
+    The group must be reentrant, so that others can ask while a transition runs.
     """
     # Not through our node's own create_publisher: this one must work in every state.
     events = Node.create_publisher(
@@ -95,10 +104,9 @@ async def _change_state(
     response.success = False
     if resolved is None:
         name = repr(asked.label) if asked.label else f"number {asked.id}"
-        allowed = ", ".join(each.value for each in state_machine.allowed()) or "nothing"
         node.get_logger().warning(
             f"cannot take transition {name} in state {state_machine.state.value!r}; "
-            f"allowed here: {allowed}"
+            f"allowed here: {state_machine.allowed()}"
         )
         return response
     try:
@@ -127,10 +135,7 @@ def _described(edges: Iterable[machine.Transition]) -> srv.GetAvailableTransitio
 
 
 class Turns:
-    """What one node has done in its executor.
-
-    Args:
-        node: whose executor it is, once it has one.
+    """What one node has done in its executor, once it has one.
 
     Attributes:
         group: reentrant, of the timers, the node's services and its clients: others may ask, and
@@ -179,3 +184,83 @@ class Turns:
         """Make the executor look at its waiting tasks again."""
         if self._node.executor is not None:
             self._node.executor.wake()
+
+
+Acts = Mapping[str, Callable[[Parameter], Any]]
+"""By name of the service: does one of the things that a request asks for; may return a future."""
+
+
+def acts_of(data_layer: DataLayer) -> Acts:
+    """Return what the services of one of our nodes do."""
+
+    def connect_to(asked: Parameter) -> None:
+        data_layer.connect_to(asked.name, connections_of(_texts(asked, "a URL or several")))
+
+    return {
+        "connect_to": connect_to,
+        "map_to": lambda asked: data_layer.map_to(
+            asked.name, _text(asked, "the connection's name")
+        ),
+        "disconnect": lambda asked: data_layer.disconnect(asked.name),
+        "remap": lambda asked: data_layer.remap(asked.name, _text(asked, "the new name")),
+    }
+
+
+def serve_interface(node: Node, acts: Acts, group: CallbackGroup) -> None:
+    """Serve a node's interface; the group must be reentrant, as a handover lasts."""
+    log = node.get_logger().error
+    for name, act in acts.items():
+        Node.create_service(
+            node, SetParameters, f"~/{name}", _serving(act, log), callback_group=group
+        )
+
+
+def _serving(
+    act: Callable[[Parameter], Any], log: Callable[[str], object]
+) -> Callable[[Any, Any], Any]:
+    """Return what answers a request for several things at once."""
+
+    def begin(asked: Parameter) -> tuple[SetParametersResult, Any]:
+        try:
+            return SetParametersResult(successful=True), act(asked)
+        except LifecycleError as error:
+            return SetParametersResult(successful=False, reason=str(error)), None
+        except Exception as error:  # noqa: BLE001 - asking must not end the node
+            log(traceback.format_exc())
+            reason = f"cannot do this: {error!r}"
+            return SetParametersResult(successful=False, reason=reason), None
+
+    async def serve(
+        request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        # All are begun before any is waited for: handovers then last as long as one.
+        for result, lasting in [begin(each) for each in request.parameters]:
+            if lasting is not None:
+                await lasting
+            response.results.append(result)
+        return response
+
+    return serve
+
+
+def _text(parameter: Parameter, what: str) -> str:
+    (text,) = _texts(parameter, what, several=False)
+    return text
+
+
+def _texts(parameter: Parameter, what: str, *, several: bool = True) -> Sequence[str]:
+    value: ParameterValue = parameter.value
+    one, many = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_STRING_ARRAY
+    if value.type == one:
+        return (str(value.string_value),)
+    if several and value.type == many:
+        return tuple(value.string_array_value)
+    wanted, hint = f"a string, type {one}", "write {type: 4, string_value: '…'}"
+    if several:
+        wanted = f"a string or an array of strings, type {one} or {many}"
+        hint += " or {type: 9, string_array_value: ['…']}"
+    raise LifecycleError(
+        f"cannot use the value given for {parameter.name!r}: {what} is {wanted}, not type "
+        f"{value.type}",
+        hint=hint,
+    )

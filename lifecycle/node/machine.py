@@ -5,8 +5,7 @@ default_state_machine.c, with connect nested inside inactive. Whatever happens t
 a row of `TABLE`, or in the author's callback between two of them. Knows no rclpy.
 
 A transition has two halves, as in rcl: a *request* moves a primary state into a transition state
-(`unconfigured` → `configuring`), and the callback's *outcome* moves it on. The data layer
-(connected or not) is part of the state, so nothing else needs to remember it.
+(`unconfigured` → `configuring`), and the callback's *outcome* moves it on.
 """
 
 from __future__ import annotations
@@ -24,14 +23,16 @@ import transitions
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
-from lifecycle.node.lifecycle import steps
-from lifecycle.node.lifecycle.steps import (
+from lifecycle.node.callbacks import (
     SUCCESS,
     CallbackOutcome,
     DeadlineError,
     Result,
     Running,
+    called,
+    result_of,
 )
+from lifecycle.node.handlers import alternatives
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,16 +115,16 @@ _STEADY = frozenset(
 )
 
 
-class TransitionRequest(enum.Enum):
-    """What may be asked of a node; values are the labels that other tools use."""
-
-    CONFIGURE = "configure"
-    CONNECT = "connect"
-    ACTIVATE = "activate"
-    DEACTIVATE = "deactivate"
-    DISCONNECT = "disconnect"
-    CLEANUP = "cleanup"
-    SHUTDOWN = "shutdown"
+REQUESTS = (
+    "configure",
+    "connect",
+    "activate",
+    "deactivate",
+    "disconnect",
+    "cleanup",
+    "shutdown",
+)
+"""What may be asked of a node, by the labels that other tools use."""
 
 
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
@@ -136,14 +137,14 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One line of the table.
+    """One line of the table; methods are those of the node's managed half, or of a part of it.
 
     Attributes:
         id: of the edge that other tools see; 0 where they see none.
         trigger: a request or an outcome.
-        condition: method of the node's managed half that must be true, or raises RefusedError.
-        before: method of it, or of a part of it, that is called before the state changes.
-        after: such a method, called once the state has changed.
+        condition: method that must be true, or raises RefusedError.
+        before: method that is called before the state changes.
+        after: method that is called once the state has changed.
     """
 
     id: int
@@ -262,7 +263,6 @@ class Machine:
     Args:
         node: has the methods that the table names, and what the author's callbacks need:
             managed.Managed.
-        timeouts: deadlines of the callbacks.
         table: TABLE; tests take lines out.
 
     Attributes:
@@ -295,16 +295,15 @@ class Machine:
                 after=[functools.partial(self._announce, row), *methods(row.after)],
             )
 
-    def allowed(self) -> tuple[TransitionRequest, ...]:
-        """Requests that are taken now, in the order of `TransitionRequest`."""
+    def allowed(self) -> str:
+        """Say which requests are taken now."""
         triggers = self._machine.get_triggers(self.state.name)
-        return tuple(each for each in TransitionRequest if each.value in triggers)
+        return ", ".join(each for each in REQUESTS if each in triggers) or "nothing"
 
     def available_transitions(self) -> tuple[Transition, ...]:
         """What get_available_transitions answers: rcl's edges from the state that others see.
 
-        From connected, disconnect is offered, and from disconnected, connect. While connecting or
-        disconnecting nothing can be asked for, so nothing is offered.
+        From connected, disconnect is offered, and from disconnected, connect.
         """
         if self.state in {NodeState.CONNECTING, NodeState.DISCONNECTING}:
             return ()
@@ -312,7 +311,7 @@ class Machine:
         seen = self.state.seen
         return tuple(t for t in TRANSITION_GRAPH if t.start == seen and t.label != hidden)
 
-    def resolve(self, transition_id: int, label: str = "") -> TransitionRequest | None:
+    def resolve(self, transition_id: int, label: str = "") -> str | None:
         """Return what a ChangeState request means here; None if this state does not offer it.
 
         A label wins over the id, as in rcl_lifecycle.
@@ -320,15 +319,11 @@ class Machine:
         for transition in self.available_transitions():
             if transition.label == label if label else transition.id == transition_id:
                 # Outcomes are edges too, but only the node itself may take them.
-                return next((r for r in TransitionRequest if r.value == transition.label), None)
+                return transition.label if transition.label in REQUESTS else None
         return None
 
-    async def change(self, request: TransitionRequest, *, permitted: bool = False) -> Result:
-        """Run a whole transition, with everything it takes on the way.
-
-        Args:
-            request: what is asked for.
-            permitted: by the supervisor, through its gate.
+    async def change(self, request: str, *, permitted: bool = False) -> Result:
+        """Run a whole transition, `permitted` by the supervisor or not.
 
         Returns:
             SUCCESS, or the first step's result that was not: after an ERROR, on_error has run and
@@ -336,7 +331,12 @@ class Machine:
 
         Raises:
             RefusedError: not allowed in this state, or another transition is running.
+            LifecycleError: no such transition.
         """
+        if request not in REQUESTS:
+            raise LifecycleError(
+                f"cannot take transition {request!r}", hint=alternatives(request, REQUESTS)
+            )
         with self._lock:
             argument = self._node.callback_argument(self.state)
             self.is_permitted = permitted
@@ -353,22 +353,19 @@ class Machine:
         return returned
 
     async def shut_down(self, reason: str) -> Result:
-        """Bring the node to finalized from wherever it is, because its process must end.
-
-        A running async callback is cancelled first; each step keeps its own deadline.
-        """
+        """Bring the node to finalized from any state; a running async callback is cancelled."""
         if not self.state.steady:
             self._interrupt(LifecycleError(f"cannot go on with {self._what}: {reason}"))
             while not self.state.steady:
                 await _NextTurn()
         if self.state is NodeState.FINALIZED:
             return SUCCESS
-        return await self.change(TransitionRequest.SHUTDOWN)
+        return await self.change("shutdown")
 
-    def _request(self, request: TransitionRequest) -> Result:
+    def _request(self, request: str) -> Result:
         """Begin a transition; what its row cannot do is a failure, as if the callback said so."""
         try:
-            return self._take(request.value)
+            return self._take(request)
         except transitions.MachineError as error:
             raise RefusedError(self._refusal(request)) from error
 
@@ -403,11 +400,11 @@ class Machine:
         deadline_s: float = getattr(self._timeouts, limit)
         what = f"{self._node.full_name}: {name}"
         late = DeadlineError(f"cannot finish {what} within its deadline of {deadline_s:g} s")
-        running = Running(steps.called(self._node.callback(name), argument))
+        running = Running(called(self._node.callback(name), argument))
         self._running, self._what = running, what
         call_off = self._node.turns.call_after(deadline_s, lambda: self._interrupt(late))
         try:
-            return await steps.result_of(running, what=what, deadline_s=deadline_s)
+            return await result_of(running, what=what, deadline_s=deadline_s)
         finally:
             self._running = None
             call_off()
@@ -418,14 +415,13 @@ class Machine:
             self._running.interrupt(error)
         self._node.turns.wake()
 
-    def _refusal(self, request: TransitionRequest) -> str:
+    def _refusal(self, request: str) -> str:
         if not self.state.steady:
             return (
-                f"cannot {request.value} while the node is {self.state.value!r}: "
+                f"cannot {request} while the node is {self.state.value!r}: "
                 "one transition at a time; ask again when it has ended"
             )
-        allowed = ", ".join(each.value for each in self.allowed()) or "nothing"
-        return f"cannot {request.value} in state {self.state.value!r}; allowed here: {allowed}"
+        return f"cannot {request} in state {self.state.value!r}; allowed here: {self.allowed()}"
 
     def _announce(self, row: Row) -> None:
         """Say what was changed; connect and disconnect are seen once they have succeeded."""

@@ -1,7 +1,4 @@
-"""The managed half of a LifecycleNode: machine, gate, data layer, services put together.
-
-It is reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
-"""
+"""The managed half of a LifecycleNode: machine, gate, data layer, services put together."""
 
 from __future__ import annotations
 
@@ -13,54 +10,48 @@ from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Health
-from lifecycle.node import configuration
-from lifecycle.node.author import parameters
-from lifecycle.node.author.handlers import alternatives, match
+from lifecycle.manifest.model import Executor
+from lifecycle.node import configuration, services
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
-from lifecycle.node.connections.connection_status import ConnectionEvents
-from lifecycle.node.connections.node_interface import acts_of, serve_interface
-from lifecycle.node.endpoints.data_layer import DataLayer
-from lifecycle.node.lifecycle import services
-from lifecycle.node.lifecycle.gate import NodeGate
-from lifecycle.node.lifecycle.health import HealthCheck
-from lifecycle.node.lifecycle.machine import (
+from lifecycle.node.connections import ConnectionEvents
+from lifecycle.node.data_layer import DataLayer
+from lifecycle.node.gate import NodeGate
+from lifecycle.node.handlers import match
+from lifecycle.node.machine import (
     Machine,
     NodeState,
     RefusedError,
     Transition,
-    TransitionRequest,
 )
-from lifecycle.node.lifecycle.services import Turns
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
+from lifecycle.node.planned import declare_parameters
+from lifecycle.node.services import Turns, acts_of, serve_interface
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
+    from lifecycle.node.gate import Later
 
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
 
 
-BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
+class NodeInHost:
+    """What a process knows of one of its nodes, whatever class it is of.
 
-
-class Managed:
-    """The managed half of one node.
+    Args:
+        supervisor: name of the system whose gate holds it; empty for none.
+        later: runs a function in the executor of the node, or beside it.
+        collect: returns its configuration as it is now.
 
     Attributes:
-        node: the LifecycleNode.
+        node: rclpy's.
         full_name: its name, fully qualified.
+        spec: what it was planned to be.
+        log: its logger.
+        gate: holds back what it sends, receives and times, and counts what arrives.
         listeners: are called with it after every change of state, whatever caused it.
-        auto: it brings itself up, unless its host says otherwise.
-        gate: holds back what the node was made to send, receive and time.
-        turns: has things done in its executor.
-        spec: what the node was planned to be.
-        data_layer: its endpoints.
-        connections: its participants.
-        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories.
     """
@@ -69,12 +60,9 @@ class Managed:
         self,
         node: Node,
         spec: PlannedNode,
-        auto: bool,
-        gate: NodeGate,
-        supervisor: str = "",
-        *,
-        served: bool = True,
-        health: Callable[[], Any] | None = None,
+        supervisor: str,
+        later: Later,
+        collect: Callable[[], NodeConfiguration],
     ) -> None:
         self.node = node
         self.full_name = str(node.get_fully_qualified_name())
@@ -82,23 +70,43 @@ class Managed:
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
-        self.auto = auto
-        self.gate = gate
-        self.turns = Turns(node)
+        self.gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
         self.listeners: list[Callable[[Any], None]] = []
+        self.log = node.get_logger()
+        self.configuration_changes = ConfigurationChanges(later, collect, failed=self.log.error)
+        changed = self.configuration_changes.touch
+        node.add_post_set_parameters_callback(lambda _: changed())
+        self.found = Found(spec.at, changed)
+
+
+class Managed(NodeInHost):
+    """The managed half of one LifecycleNode.
+
+    Attributes:
+        auto: it brings itself up, unless its host says otherwise.
+        turns: has things done in its executor.
+        data_layer: its endpoints.
+        connections: its participants.
+        connection_events: what becomes of its connections and mappings.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        spec: PlannedNode,
+        auto: bool,
+        supervisor: str = "",
+        *,
+        served: bool = True,
+        health: Callable[[], Any] | None = None,
+    ) -> None:
+        self.turns = Turns(node)
+        super().__init__(node, spec, supervisor, self.turns.call_soon, self.get_configuration)
+        self.auto = auto
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
         self._publish: Callable[[Transition], None] = lambda _: None
-        self.configuration_changes = ConfigurationChanges(
-            self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
-        )
-        changed = self.configuration_changes.touch
-        self._health: HealthCheck | None = None
-        if health is not None:
-            how, failed = spec.health or Health(), node.get_logger().error
-            self._health = HealthCheck(health, self.turns, how, changed=changed, failed=failed)
-        node.add_post_set_parameters_callback(lambda _: changed())
-        self.found = Found(spec.at, changed)
+        self._health = None if health is None else HealthCheck(self, health)
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
@@ -112,7 +120,7 @@ class Managed:
 
     @property
     def state(self) -> NodeState:
-        """The state, nested ones distinguished; `state.seen` is what other tools see."""
+        """The state; `state.seen` is what other tools see."""
         return self._machine.state
 
     @property
@@ -121,7 +129,7 @@ class Managed:
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
 
-    async def change(self, request: TransitionRequest | str) -> Result:
+    async def change(self, request: str) -> Result:
         """Run a transition from inside the executor: `await node.lifecycle.change("connect")`.
 
         Raises:
@@ -129,29 +137,24 @@ class Managed:
                 the node's supervisor is closed.
             LifecycleError: no such transition.
         """
-        return await self._machine.change(_known(request))
+        return await self._machine.change(request)
 
-    async def change_for_supervisor(self, request: TransitionRequest | str) -> Result:
+    async def change_for_supervisor(self, request: str) -> Result:
         """Run a transition that the supervisor asked for; its activate is the gate's permit.
 
         A node that it lets through may be deactivated and activated again by any client, until the
         supervisor deactivates it or its data layer goes, which is what was verified. A node that
-        another client has deactivated already is where the supervisor wants it.
-
-        Raises:
-            RefusedError: as for `change`.
-            LifecycleError: no such transition.
+        another client has deactivated already is where the supervisor wants it. Raises as `change`.
         """
-        known = _known(request)
-        if self._supervisor and known is TransitionRequest.DEACTIVATE:
+        if self._supervisor and request == "deactivate":
             self._let_through = False
             if self.state is NodeState.INACTIVE_CONNECTED:
                 return SUCCESS
-        if known is not TransitionRequest.ACTIVATE:
-            return await self._machine.change(known)
+        if request != "activate":
+            return await self._machine.change(request)
         if self._supervisor and self.state is not NodeState.ACTIVE:
             self._let_through = False  # an earlier permit does not outlast one that fails
-        result = await self._machine.change(known, permitted=True)
+        result = await self._machine.change(request, permitted=True)
         if result.outcome is CallbackOutcome.SUCCESS:
             self._let_through = True
         return result
@@ -159,7 +162,7 @@ class Managed:
     async def bring_up(self) -> Result:
         """Configure, connect and activate; stops at the first that does not succeed."""
         result = SUCCESS
-        for request in BRING_UP:
+        for request in ("configure", "connect", "activate"):
             result = await self._machine.change(request)
             if result.outcome is not CallbackOutcome.SUCCESS:
                 break
@@ -175,7 +178,7 @@ class Managed:
         end = self.turns.call_every(0.0, once)
 
     def close(self) -> None:
-        """Leave the graph and take the data layer away: the node is being destroyed."""
+        """Leave the graph: the node is being destroyed."""
         self.turns.close()
         self.data_layer.remove()
         if self._reporter is not None:
@@ -200,7 +203,7 @@ class Managed:
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
         handlers, timed = match(self.node, self.data_layer.unhandled, name=self.full_name)
-        parameters.declare(self.node, self.spec)
+        declare_parameters(self.node, self.spec)
         self.data_layer.prepare(handlers)
         for method, period_s in timed:
             self._method_timers.append(self.node.create_timer(period_s, method))
@@ -234,13 +237,7 @@ class Managed:
                 self.node.get_logger().error(traceback.format_exc())
 
     def changed(self, state: NodeState, event: Transition | None) -> None:
-        """Notify others of a change of the state.
-
-        Args:
-            state: the new one.
-            event: the edge that other tools are to be shown; None for a change that they do not
-                see.
-        """
+        """Notify others of the new state, and other tools of the edge, if they see one."""
         if self._supervisor and state in _WITHOUT_DATA_LAYER:
             self._let_through = False
         if event is not None:
@@ -265,10 +262,9 @@ class Managed:
 
     def report(self, result: Result) -> None:
         """Log why a step did not succeed, with the traceback where there is one."""
-        logger = self.node.get_logger()
         if result.trace:
-            logger.error(result.trace)
-        logger.error(result.error)
+            self.log.error(result.trace)
+        self.log.error(result.error)
 
     # Inside.
 
@@ -290,11 +286,3 @@ class Managed:
             self._reporter.report_configuration(now)
         else:
             self._reporter.report(checksum=now.checksum)
-
-
-def _known(request: TransitionRequest | str) -> TransitionRequest:
-    try:
-        return TransitionRequest(request)
-    except ValueError as error:
-        hint = alternatives(str(request), [each.value for each in TransitionRequest])
-        raise LifecycleError(f"cannot take transition {request!r}", hint=hint) from error

@@ -1,15 +1,17 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
 The factories of our own node are for what its author's code makes. What exists where is
-data_layer.py's.
+data_layer.py's. Blocking calls of what is made here raise where they would wait for ever.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
@@ -20,14 +22,13 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
 from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
-from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
-from lifecycle.node.lifecycle.gate import GatedSubscription
-from lifecycle.node.lifecycle.steps import called
+from lifecycle.node.callbacks import called
+from lifecycle.node.endpoint import CLIENTS, Endpoint, wire_name
+from lifecycle.node.gate import GatedSubscription
 
 if TYPE_CHECKING:
-    from lifecycle.node.author.managed import Managed
-    from lifecycle.node.connections.connections import Connection
+    from lifecycle.node.connections import Connection
+    from lifecycle.node.managed import Managed
 
 
 _DESTROY = {
@@ -39,23 +40,16 @@ _DESTROY = {
 
 
 class Maker:
-    """Makes and destroys the entities of one node, whose executor runs their callbacks.
-
-    Its gate holds subscriptions back; publishers are held back by their handles.
-    """
+    """Makes and destroys the entities of one node, whose executor runs their callbacks."""
 
     def __init__(self, managed: Managed) -> None:
+        self._managed = managed
         self._node = managed.node
         self._gate = managed.gate
         self._turns = managed.turns
-        self._changed = managed.configuration_changes.touch
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
-        """Return a new rclpy entity of an endpoint on a connection.
-
-        Raises:
-            LifecycleError: the RMW refused, with its reason; nothing is left.
-        """
+        """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
         kind, introspection = endpoint.kind, endpoint.options.get("introspection")
         make = self._served
         if kind is EndpointKind.PUBLISHER:
@@ -88,11 +82,7 @@ class Maker:
             getattr(self._node, _DESTROY[kind])(entity)
 
     def expand(self, endpoint: Endpoint, name: str) -> str:
-        """Return a new name for an endpoint fully qualified; no remapping rule applies.
-
-        Raises:
-            LifecycleError: it cannot be a name.
-        """
+        """Return a new name for an endpoint fully qualified; no remapping rule applies."""
         resolve = self._node.resolve_service_name
         if endpoint.kind.is_topic:
             resolve = self._node.resolve_topic_name
@@ -156,7 +146,7 @@ class Maker:
                 return GoalClient(
                     node, interface, name, group=group, refuse_to_block=refuse_to_block
                 )
-            goals = Goals(self._node, endpoint, self._gate, self._changed)
+            goals = Goals(self._managed, endpoint)
             goals.server = GoalServer(
                 node, interface, name, goals.execute, accept=goals.accept, group=group
             )
@@ -177,10 +167,7 @@ class Maker:
         return service
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
-        """Return what an endpoint is called where it is made.
-
-        The hidden nodes of other participants resolve nothing: remaps belong to our node.
-        """
+        """Return what an endpoint is called where it is made: hidden nodes resolve nothing."""
         if endpoint.given_name or connection.participant is None:
             return endpoint.given_name or endpoint.name
         return resolve_name(self._node, endpoint.kind, endpoint.name)
@@ -188,7 +175,7 @@ class Maker:
     def _survive_late_answers(self, service: Any, name: str) -> None:
         """Let an answer after its server was destroyed be lost, not end the process."""
         send = service.send_response
-        warn = self._node.get_logger().warning
+        warn = self._managed.log.warning
 
         @functools.wraps(send)
         def send_response(response: Any, header: Any) -> None:
@@ -219,3 +206,42 @@ def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
         return response if returned is None else returned
 
     return answer
+
+
+_SPINNING = {
+    ("rclpy.executors", "spin_once"),
+    ("rclpy.executors", "spin_once_until_future_complete"),
+    ("lifecycle.node.host.loop", "turn"),
+    ("lifecycle.node.host.loop", "_spin"),
+}
+"""Where a single-threaded executor calls back: rclpy's, and those of our own processes."""
+
+
+class DeadlockError(LifecycleError):
+    """A blocking call was made in the thread that would have to bring its answer."""
+
+
+def refuse_to_deadlock(client: Client) -> None:
+    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
+    blocking = client.call
+
+    @functools.wraps(blocking)
+    def call(*arguments: Any, **options: Any) -> Any:
+        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
+        return blocking(*arguments, **options)
+
+    client.call = call
+
+
+def refuse_to_block(what: str, instead: str) -> None:
+    """Raise DeadlockError inside the executor, where waiting for `what` would never end."""
+    # A multi-threaded executor runs callbacks in other threads than the one that spins.
+    frame = inspect.currentframe()
+    while frame is not None:
+        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
+            raise DeadlockError(
+                f"cannot wait for {what} in a callback: the answer comes by the executor that "
+                "waits for this callback",
+                hint=f"write `async def` and `await {instead}`",
+            )
+        frame = frame.f_back

@@ -1,8 +1,4 @@
-"""LifecycleNode: the class to derive from, as its author sees it.
-
-rclpy's factories are overridden, so that what they make is known, and sends and receives only while
-active. What all of it does is put together in managed.py.
-"""
+"""LifecycleNode: the class to derive from, as its author sees it; managed.py is behind it."""
 
 from __future__ import annotations
 
@@ -25,27 +21,30 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind, Executor
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.author.blocking import refuse_to_deadlock
-from lifecycle.node.author.handlers import ActionHandler
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import (
+from lifecycle.node.connections import Connection, ConnectionEvent, connections_of
+from lifecycle.node.endpoint import Placement, interface_name
+from lifecycle.node.gate import (
+    DeclaredPublisher,
+    GatedPublisher,
+    GatedSubscription,
+    GatedTimer,
+    NodeGate,
+)
+from lifecycle.node.handlers import ActionHandler
+from lifecycle.node.machine import NodeState
+from lifecycle.node.making import refuse_to_deadlock, resolve_name
+from lifecycle.node.managed import Managed
+from lifecycle.node.planned import (
     Construction,
     calling_position,
     default_name,
     is_auto,
     plan_without_manifest,
 )
-from lifecycle.node.connections.connection_status import ConnectionEvent
-from lifecycle.node.connections.connections import Connection, connections_of
-from lifecycle.node.endpoints.endpoint import Placement, interface_name
-from lifecycle.node.endpoints.making import resolve_name
-from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
-from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.outcome import ConnectionReport
 
@@ -80,14 +79,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     With a manifest that declares a publisher `chatter` and a subscription `echo`:
 
         class Talker(LifecycleNode):
-            def on_configure(self):
-                self.chatter = self.publisher("chatter")
-                self.count = 0
-
             @on_timer(period_s=0.5)
             def tick(self):
-                self.count += 1
-                self.chatter.publish(Int32(data=self.count))
+                self.publisher("chatter").publish(Int32(data=1))
 
             @on_message("echo")
             def heard(self, message):
@@ -96,9 +90,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     Without a manifest, it declares them itself, `self.declare_publisher("chatter", Int32)`, and
     drives itself up, `super().__init__("talker", lifecycle="auto")`.
 
-    Callbacks `on_configure`, `on_connect`, `on_activate`, `on_deactivate`, `on_disconnect`,
-    `on_cleanup`, `on_shutdown` and `on_error` take `(self, state)` or `(self)`, return SUCCESS,
-    FAILURE, ERROR or None for SUCCESS, and may be `async def`:
+    Its callbacks, `on_…`, take `(self, state)` or `(self)`, return SUCCESS, FAILURE, ERROR or None
+    for SUCCESS, and may be `async def`:
 
         async def on_activate(self, state):
             answer = await self.client("calibrate").call_async(Trigger.Request())
@@ -154,18 +147,17 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         if spec is None:
             name, namespace = self.get_name(), self.get_namespace()
             spec = plan_without_manifest(type(self), name=name, namespace=namespace)
-        self._gate = NodeGate(counts=spec.run.executor is not Executor.EVENTS)
-        if spec.log_level:
-            self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         self.lifecycle = Managed(
             self,
             spec,
             auto,
-            self._gate,
             by_host.supervisor if by_host is not None else "",
             served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
+        self._gate = self.lifecycle.gate
+        if spec.log_level:
+            self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
         if by_host is None and auto:
             self.lifecycle.bring_up_when_spun()
 
@@ -180,20 +172,21 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Raises:
             UnknownEndpointError: nothing of that name is declared; a KeyError too.
         """
-        return self.lifecycle.data_layer.publisher(name)
+        handle = self.lifecycle.data_layer.declared(EndpointKind.PUBLISHER, name).handle
+        assert handle is not None
+        return handle
 
     def client(self, name: str) -> Client:
         """Return the declared service client `name`, from on_connect on.
 
-        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` would
-        wait for the executor that is waiting for it.
+        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` raises
+        DeadlockError.
 
         Raises:
             UnknownEndpointError: nothing of that name is declared; a KeyError too.
             LifecycleError: the node is not connected.
         """
-        client: Client = self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
-        return client
+        return self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
 
     def subscription(self, name: str) -> Subscription:
         """Return rclpy's object of the declared subscription `name`, from on_connect on.
@@ -213,14 +206,12 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         In callbacks, `goal = await self.action_client("dock").send_goal_async(Dock.Goal())`, then
         `await goal.get_result_async()`; the blocking calls raise DeadlockError.
         """
-        client: ActionClient = self.lifecycle.data_layer.entity(EndpointKind.ACTION_CLIENT, name)
-        return client
+        return self.lifecycle.data_layer.entity(EndpointKind.ACTION_CLIENT, name)
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds` (> 0) of wall time: `await self.sleep(0.1)`.
 
-        For `async def` callbacks, above all handlers of actions: whatever else the node has to do
-        goes on meanwhile, requests to cancel a goal included.
+        Whatever else the node has to do goes on meanwhile, requests to cancel a goal included.
         """
         future: Future = Future()
         self.lifecycle.turns.call_after(seconds, lambda: future.set_result(None))
@@ -294,7 +285,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
 
         Args:
             name: relative, absolute or private.
-            msg_type: message class.
+            msg_type: its class.
             qos: a number is a history depth.
             lossy: hint for negotiation: the data bear an unreliable transport.
             size_bytes: hint for negotiation: the largest serialized message, > 0.
@@ -350,9 +341,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
 
         One that is declared after configure needs its `callback` given here, and with it `accept`,
         which decides on goals as a method decorated with `@on_goal(name)` does.
-
-        Raises:
-            LifecycleError: as declare_publisher, or `accept` is given without `callback`.
         """
         if accept is not None and callback is None:
             raise LifecycleError(

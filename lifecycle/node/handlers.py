@@ -1,7 +1,7 @@
 """Decorators that tie a method to a declared endpoint, and the matching of the two.
 
 Every declared subscription, service server and action server has exactly one handler, and every
-handler an endpoint. Pure: knows no rclpy.
+handler an endpoint.
 """
 
 from __future__ import annotations
@@ -38,12 +38,7 @@ class _Mark(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
-    """What an action server gives its goals to.
-
-    Attributes:
-        execute: works on a goal that was accepted; takes rclpy's ServerGoalHandle.
-        accept: decides on a goal, given the goal; None takes all.
-    """
+    """What an action server gives its goals to; without `accept` it takes all."""
 
     execute: Callable[..., Any]
     accept: Callable[..., Any] | None = None
@@ -56,6 +51,8 @@ class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
 def on_message(subscription: str) -> Callable[[F], F]:
     """Let a method receive a declared subscription's messages, only while the node is active.
 
+    It may be `async def`, and may take rclpy's message info as a second argument.
+
     Args:
         subscription: the name as the manifest declares it, before remapping.
 
@@ -64,8 +61,6 @@ def on_message(subscription: str) -> Callable[[F], F]:
         ...     @on_message("/robot/video")
         ...     def show(self, image):
         ...         self.get_logger().info(f"{len(image.data)} bytes")
-
-    The method may be `async def`, and may take rclpy's message info as a second argument.
     """
     return _marker(_Mark(kind=EndpointKind.SUBSCRIPTION, name=subscription))
 
@@ -74,16 +69,14 @@ def on_service(service: str) -> Callable[[F], F]:
     """Let a method answer a declared service server, from connect until disconnect.
 
     ROS has no way to refuse a request politely, so a service answers in inactive/connected too;
-    a handler that must not is free to look at `self.is_active`.
+    a handler that must not is free to look at `self.is_active`. It may be `async def`, and may
+    return None when it has filled in `response`.
 
     Example:
         >>> class Base(LifecycleNode):
         ...     @on_service("reset")
         ...     def reset(self, request, response):
         ...         response.success = True
-        ...         return response
-
-    The method may be `async def`, and may return None when it has filled in `response`.
     """
     return _marker(_Mark(kind=EndpointKind.SERVICE_SERVER, name=service))
 
@@ -101,11 +94,10 @@ def on_action(action: str) -> Callable[[F], F]:
         >>> class Base(LifecycleNode):
         ...     @on_action("dock")
         ...     async def dock(self, goal_handle):
-        ...         while (distance := self.distance()) > 0.01:
+        ...         while self.distance() > 0.01:
         ...             if goal_handle.is_cancel_requested:
         ...                 goal_handle.canceled()
         ...                 return None
-        ...             goal_handle.publish_feedback(Dock.Feedback(distance=distance))
         ...             await self.sleep(0.1)
         ...         goal_handle.succeed()
         ...         return Dock.Result()
@@ -117,11 +109,7 @@ def on_action(action: str) -> Callable[[F], F]:
     When the node leaves the active state, or the action is taken off its connection, what is being
     executed ends: `GoalInterruptedError` is raised in an `async def` method where it awaits, its
     goal is aborted unless the method says otherwise on its way out, and clients have their answer
-    before on_deactivate or on_shutdown runs. Publishers still publish meanwhile:
-
-        ...         except GoalInterruptedError:
-        ...             self.publisher("cmd_vel").publish(Twist())
-        ...             raise
+    before on_deactivate or on_shutdown runs. Publishers still publish meanwhile.
     """
     return _marker(_Mark(kind=EndpointKind.ACTION_SERVER, name=action))
 
@@ -185,12 +173,7 @@ def needs_handler(kind: EndpointKind) -> bool:
 def match(
     node: object, endpoints: Iterable[PlannedEndpoint], *, name: str
 ) -> tuple[dict[Key, Callable[..., Any]], list[tuple[Callable[..., Any], float]]]:
-    """Pair the decorated methods of a node with the endpoints that need a handler.
-
-    Args:
-        node: of a class with decorated methods, its own or inherited.
-        endpoints: every declared endpoint; only the kinds that need a handler are looked at.
-        name: of the node, fully qualified, for messages.
+    """Pair the decorated methods of a node, called `name`, with the endpoints that need a handler.
 
     Returns:
         What handles each endpoint; and what is called each so many seconds.

@@ -1,1 +1,0 @@
-"""The API for node authors: LifecycleNode, handlers, declarations in code, parameters."""

@@ -1,1 +1,0 @@
-"""The node interface and the connections it makes."""

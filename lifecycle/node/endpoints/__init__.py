@@ -1,1 +1,0 @@
-"""Declared endpoints: their rclpy entities, and the connections that these are on."""
