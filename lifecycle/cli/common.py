@@ -20,7 +20,7 @@ import click
 from lifecycle.cli.completion import completing
 from lifecycle.errors import UsageError, did_you_mean
 from lifecycle.printable import lines
-from lifecycle.programming.names import TARGETS
+from lifecycle.programming import TARGETS
 
 if TYPE_CHECKING:
     from lifecycle.manifest.loading import Loaded

@@ -19,7 +19,7 @@ import msgspec
 import yaml
 
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.names import TARGETS
+from lifecycle.programming import TARGETS
 from lifecycle.programming.target import SettingsError, target_kind
 
 _MAX_BYTES = 256 * 1024

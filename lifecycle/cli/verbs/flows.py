@@ -46,7 +46,7 @@ from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
 from lifecycle.programming.flows_csv import flows_to_csv
-from lifecycle.programming.names import TARGETS
+from lifecycle.programming import TARGETS
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
