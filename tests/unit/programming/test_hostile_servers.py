@@ -17,9 +17,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import BringUpError
-from lifecycle.programming.http import Api
+from lifecycle.programming.http import Api, ServerSettings
 from lifecycle.programming.programmer import Programmer
-from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import (
     HttpError,
     Means,
