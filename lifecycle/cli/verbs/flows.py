@@ -36,8 +36,8 @@ from lifecycle.cli.common import (
     wrapped,
 )
 from lifecycle.cli.measured import Record, cells
-from lifecycle.cli.verbs.verify import exit_code
-from lifecycle.cli.watched import Watched
+from lifecycle.cli.report import exit_code
+from lifecycle.cli.standard_streams import Watched
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import UniqueHow
@@ -45,8 +45,8 @@ from lifecycle.measure.flows import FlowMeasurement, measured_summary
 from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
-from lifecycle.programming.flows_csv import flows_to_csv
 from lifecycle.programming import TARGETS
+from lifecycle.programming.flows_csv import flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
