@@ -177,7 +177,7 @@ def measure(
         verb = ("up", str(file), "--format", "json", "--timeout", str(bound_s))
         try:
             used = run(
-                [sys.executable, "-m", "lifecycle.cli", *verb],
+                [sys.executable, "-m", "lifecycle", *verb],
                 is_active=is_active,
                 variables=variables,
                 bound_s=bound_s,

@@ -72,7 +72,7 @@ def measure(nodes: int, domain_id: int, changes: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "changed.lifecycle.yaml"
         file.write_text(system(nodes, domain_id), encoding="utf-8")
-        up = [sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"]
+        up = [sys.executable, "-m", "lifecycle", "up", str(file), "--format", "json"]
         with (
             subprocess.Popen(
                 [*up, "--timeout", str(60 + 3 * nodes)],

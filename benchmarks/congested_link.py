@@ -48,7 +48,7 @@ UP_S = 30.0
 FILL_S = BUFFER_S / (LOAD - 1) + 0.5
 """Until the buffer is full: it fills with what is offered beyond what leaves."""
 
-PYTHON = (sys.executable, "-m", "lifecycle.cli")
+PYTHON = (sys.executable, "-m", "lifecycle")
 DOMAIN = 7
 
 

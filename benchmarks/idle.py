@@ -90,7 +90,7 @@ def supervised(system: dict[str, Any], what: str, seconds: float) -> None:
         file = Path(directory) / "idle.lifecycle.yaml"
         file.write_text(yaml.safe_dump(system))
         with subprocess.Popen(
-            [sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"],
+            [sys.executable, "-m", "lifecycle", "up", str(file), "--format", "json"],
             cwd=ROOT,
             env={**os.environ, "XDG_RUNTIME_DIR": directory, "ROS_LOG_DIR": directory},
             stdout=subprocess.PIPE,

@@ -59,7 +59,7 @@ class Machine:
         self._arrived = threading.Condition()
         self.process = subprocess.Popen(
             host.command(
-                *(sys.executable, "-m", "lifecycle.cli", "up", str(manifest)),
+                *(sys.executable, "-m", "lifecycle", "up", str(manifest)),
                 *("--machine", name, "--format", "json", "--keep-going"),
                 guarded=True,
             ),

@@ -221,7 +221,7 @@ def forked_ours(nodes: int, domain_id: int) -> list[Cost]:
         file.write_text(
             yaml.safe_dump(manifest(nodes, "single", domain_id, "localhost")), encoding="utf-8"
         )
-        with running("-m", "lifecycle.cli", "up", str(file), "--format", "json") as process:
+        with running("-m", "lifecycle", "up", str(file), "--format", "json") as process:
             pids = hosted_pids(process)
             time.sleep(SETTLE_S)
             return measure(pids, services_of(domain_id, nodes))

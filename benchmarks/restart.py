@@ -73,7 +73,7 @@ def stage_of(event: dict[str, Any]) -> str:
 def measure(path: Path, kills: int) -> tuple[float, list[dict[str, float]]]:
     """Return how long bring-up took, and for each kill when each stage was over, in seconds."""
     began_s = time.monotonic()
-    command = [sys.executable, "-m", "lifecycle.cli", "up", str(path), "--format", "json"]
+    command = [sys.executable, "-m", "lifecycle", "up", str(path), "--format", "json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout is not None
     up_s = killed_s = 0.0

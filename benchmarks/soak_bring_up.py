@@ -47,7 +47,7 @@ def bring_up(manifest: Path, keep: Path | None, number: int) -> tuple[int, float
     with tempfile.TemporaryFile("w+") as errors:
         done = subprocess.run(
             [
-                *(sys.executable, "-m", "lifecycle.cli", "up", str(manifest)),
+                *(sys.executable, "-m", "lifecycle", "up", str(manifest)),
                 *("--stop-after", "0", "--format", "json"),
             ],
             cwd=ROOT,

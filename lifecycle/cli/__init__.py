@@ -17,7 +17,7 @@ from typing import NamedTuple, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
-from lifecycle.cli.completion import COMPLETE
+from lifecycle.cli.common import COMPLETE
 from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, did_you_mean, exhausted
 from lifecycle.printable import lines
@@ -91,6 +91,7 @@ VERBS = {
         "judge a running system, started by anyone; for CI",
         "verify robot.lifecycle.yaml --format junit",
         ROS,
+        "check:verify",
     ),
     "flows": Verb("show every network flow and how unique it is", "flows robot --export nft", ROS),
     "graph": Verb(
@@ -106,7 +107,7 @@ VERBS = {
         "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
         "import robot.launch.py > robot.lifecycle.yaml",
         "",
-        "import_",
+        "capture:import",
     ),
     "capture": Verb(
         "write a manifest from a running system, gaps marked",
@@ -119,14 +120,22 @@ VERBS = {
         LINUX,
     ),
     "history": Verb(
-        "show what happened in a run, from its journal", "history --system robot", LINUX
+        "show what happened in a run, from its journal",
+        "history --system robot",
+        LINUX,
+        "logs:history",
     ),
     "run": Verb(
         "run one node of a manifest in this terminal, without a supervisor",
         "run robot.lifecycle.yaml camera --manual",
         ROS,
     ),
-    "ports": Verb("DDS port arithmetic and platform limits", "ports --domain 7 --participant 3"),
+    "ports": Verb(
+        "DDS port arithmetic and platform limits",
+        "ports --domain 7 --participant 3",
+        "",
+        "plan:ports",
+    ),
     "init": Verb(
         "make a package of one's own: nodes, manifest, tests, CI workflow", "init my_robot"
     ),

@@ -36,7 +36,7 @@ class LifecycleManifest(ExecuteProcess):  # type: ignore[misc]
         options: list[Any] | None = None,
         **process: Any,
     ) -> None:
-        words: list[Any] = [sys.executable, "-m", "lifecycle.cli", "up", manifest]
+        words: list[Any] = [sys.executable, "-m", "lifecycle", "up", manifest]
         for name, value in (arguments or {}).items():
             parts = value if isinstance(value, (list, tuple)) else [value]
             words.append([f"{name}:=", *parts])

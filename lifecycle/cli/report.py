@@ -143,6 +143,17 @@ def format_verdict(
     return render_text(verdict, colour=colour)
 
 
+def exit_code(verdict: Verdict, *, strict: bool) -> ExitCode:
+    """Return the exit code of a verdict."""
+    from lifecycle.supervisor.core.gate import closes
+    from lifecycle.verify.outcome import Outcome
+
+    if not closes(verdict, strict=strict):
+        return ExitCode.OK
+    violated = verdict.verdict is Outcome.VIOLATED
+    return ExitCode.VIOLATED if violated else ExitCode.UNVERIFIABLE
+
+
 class ReportFile:
     """The report of one command; use it in a `with` around all that may fail.
 

@@ -15,11 +15,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.programming.http import ID_PATTERN, text_of
+from lifecycle.programming.http import ID_PATTERN, ServerSettings, is_gone, read_answer, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
-from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import HttpError, PartlyError, each_done
 
 _COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
@@ -116,7 +115,7 @@ class CamaraTarget(ServerTarget):
             HttpError: refused, or the network cannot provide it.
         """
         reply = self._api.request("POST", self.collection, body)
-        session = reply.read(_Session)
+        session = read_answer(reply, _Session)
         id_ = session.session_id
         try:
             session = self._settled(session)
@@ -128,17 +127,17 @@ class CamaraTarget(ServerTarget):
             raise
         raise HttpError(
             f"cannot get this QoS: the network made session {id_} unavailable ({session.why})",
-            status=reply.status,
+            status=reply.status_code,
         )
 
     def look(self, id_: str, body: Body) -> Made | None:
         """GET it, or all of the device; one that has ended differs, for it is deleted first."""
         if id_:
             reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-            return None if reply.gone else self._made(reply.read(_Session), body)
+            return None if is_gone(reply) else self._made(read_answer(reply, _Session), body)
         asked = {"device": body["device"]}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
-        for each in () if reply.gone else reply.read(tuple[_Session, ...]):
+        for each in () if is_gone(reply) else read_answer(reply, tuple[_Session, ...]):
             if not differs(body, each, _COMPARED, missing=True):
                 return self._made(each, body)
         return None
@@ -175,8 +174,8 @@ class CamaraTarget(ServerTarget):
             if error.status not in (400, 409):
                 raise
         else:
-            if not reply.gone:
-                made = self._made(reply.read(_Session), body)
+            if not is_gone(reply):
+                made = self._made(read_answer(reply, _Session), body)
                 if made.expires_s is not None and made.expires_s > (entry.expires_s or 0.0) + 1:
                     return made
         return self.update(entry.id, body, body)
@@ -200,7 +199,7 @@ class CamaraTarget(ServerTarget):
                 break
             self._api.pause(min(wait_s, left_s))
             wait_s *= 2
-            session = self._api.request("GET", path).read(_Session)
+            session = read_answer(self._api.request("GET", path), _Session)
         return session
 
     def _made(self, session: _Session, body: Body) -> Made:

@@ -1,30 +1,225 @@
-"""HTTP to a network's exposure interface: one request at a time, with a deadline, retries, checks.
+"""Servers that are reached over HTTP: their settings file, and one request at a time.
 
-Owns: which answers are tried again and when, that a token goes to one server only and into no log,
-that no server holds a request up past its deadline, and how a refusal and an answer that cannot be
-used read: every one of them is an `HttpError` that names the request and the field. Knows nothing
-of what is asked for.
+Owns: keys that every such target has, and where a token is: it is read at the moment it is needed,
+goes to one server only and into no log. Also which answers are tried again and when, that no server
+holds a request up past its deadline, and how a refusal and an answer that cannot be used read: an
+`HttpError` that names the request and the field. Knows nothing of what is asked for.
 """
 
 from __future__ import annotations
 
 import email.utils
+import errno
+import ipaddress
 import os
 import re
+import stat
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote, unquote, urlsplit
 
 import msgspec
+import yaml
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.programming.settings import ServerSettings, readable
-from lifecycle.programming.target import HttpError, Means, ProgrammingError, SettingsError
+from lifecycle.network.nfe import is_loopback
+from lifecycle.programming import TARGETS
+from lifecycle.programming.target import (
+    HttpError,
+    Means,
+    ProgrammingError,
+    SettingsError,
+    target_kind,
+)
 
 try:
     import httpx
 except ModuleNotFoundError:  # an extra: most systems program no network that is reached over HTTP
     httpx = None  # type: ignore[assignment]
+
+_MAX_BYTES = 256 * 1024
+_MAX_TOKEN_BYTES = 64 * 1024
+
+IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+def read_file(path: str | Path, most: int) -> bytes:
+    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return file.read(most)
+
+
+class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a bearer token is: exactly one of the two.
+
+    Attributes:
+        env: name of an environment variable.
+        file: path of a file; a relative one is beside the settings file.
+    """
+
+    env: str = ""
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        if bool(self.env) == bool(self.file):
+            raise ValueError("cannot find the token: give exactly one of env and file")
+
+    def reveal(self) -> str:
+        """Return the token itself.
+
+        Raises:
+            SettingsError: it is not there, or is no token; its text is never quoted.
+        """
+        if self.env:
+            text = os.environ.get(self.env, "")
+            where = f"environment variable {self.env}"
+        else:
+            where = f"file {self.file!r}"
+            try:
+                text = read_file(self.file, _MAX_TOKEN_BYTES).decode("ascii")
+            except (OSError, UnicodeDecodeError) as error:
+                reason = error.strerror if isinstance(error, OSError) else "it is not ASCII text"
+                # The cause is left out on purpose: a decoding error quotes the bytes.
+                raise SettingsError(f"cannot read the token from {where}: {reason}") from None
+        token = text.strip()
+        if not token:
+            raise SettingsError(f"cannot read the token from {where}: it is empty or not set")
+        # RFC 6750 §2.1: anything else could end the header line.
+        if not token.isascii() or any(not 0x21 <= ord(each) <= 0x7E for each in token):
+            raise SettingsError(
+                f"cannot use the token from {where}: it has characters that no token has"
+            )
+        return token
+
+
+class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a server; what it is asked for is its target's.
+
+    Attributes:
+        url: of its interface.
+        devices: addresses or networks of the network's devices, `10.45.0.0/16`.
+        token: None sends none.
+        timeout_s: of one request, > 0.
+    """
+
+    url: str
+    devices: tuple[str, ...]
+    token: Token | None = None
+    timeout_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        self._check_url()
+        if not 0 < self.timeout_s < float("inf"):
+            raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
+        if not self.networks:
+            raise ValueError(
+                "cannot tell which ends of flows are devices: devices is empty; name the addresses "
+                "or networks of the devices, such as 10.45.0.0/16"
+            )
+
+    @property
+    def networks(self) -> tuple[IpNetwork, ...]:
+        """What `devices` names.
+
+        Raises:
+            ValueError: something that is no network.
+        """
+        try:
+            return tuple(ipaddress.ip_network(each, strict=False) for each in self.devices)
+        except ValueError as error:
+            raise ValueError(
+                f"cannot use devices: {error}; use 10.45.0.0/16, for example"
+            ) from None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is on this host."""
+        host = urlsplit(self.url).hostname or ""
+        return host == "localhost" or is_loopback(host)
+
+    @property
+    def scope(self) -> str:
+        """What the server is told apart from others by, and where it is asked: a URL."""
+        return self.url.rstrip("/")
+
+    def _check_url(self) -> None:
+        """A URL that a token may be sent to: https, or this host."""
+        url, parts = self.url, urlsplit(self.url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
+        if parts.username or parts.password:
+            raise ValueError("cannot use a url with a password in it; use token")
+        if parts.query or parts.fragment:
+            raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
+        if self.token is not None and parts.scheme == "http" and not self.is_local:
+            raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
+
+
+def load_settings(path: str | Path) -> dict[str, ServerSettings]:
+    """Read a settings file, YAML or JSON.
+
+    Returns:
+        By the names of their targets, those that the file has.
+
+    Raises:
+        SettingsError: it cannot be read, or a key or value is not allowed; says which.
+    """
+    types = {name: target_kind(name).settings_type for name in TARGETS}
+    file = Path(path)
+    keys = [(name, type_ | None, None) for name, type_ in types.items() if type_ is not None]
+    file_type = msgspec.defstruct("Settings", keys, frozen=True, forbid_unknown_fields=True)
+    try:
+        data = read_file(file, _MAX_BYTES + 1)
+    except OSError as error:
+        raise SettingsError(f"cannot read settings {str(path)!r}: {error.strerror}") from error
+    if len(data) > _MAX_BYTES:
+        raise SettingsError(f"cannot read settings {str(path)!r}: larger than {_MAX_BYTES} bytes")
+    try:
+        # JSON is YAML, and the keys of a JSON object are converted like those of YAML.
+        plain = yaml.safe_load(data)
+        found = msgspec.convert(plain, file_type, strict=False)
+    except yaml.YAMLError as error:
+        # Only where: the library's own text quotes the line, which may hold a pasted token.
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f" at line {mark.line + 1}, column {mark.column + 1}"
+        raise SettingsError(f"cannot read settings {str(path)!r}: no YAML{where}") from None
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"cannot use settings {str(path)!r}: {readable(error)}") from error
+    except (ValueError, OverflowError, RecursionError):
+        # Dates and numbers that are none, and what is nested deeper than Python goes.
+        raise SettingsError(
+            f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
+            "that is none"
+        ) from None
+    servers = {name: getattr(found, name) for name, *_ in keys}
+    folder = file.absolute().parent
+    return {name: _beside(each, folder) for name, each in servers.items() if each is not None}
+
+
+def _beside(settings: ServerSettings, folder: Path) -> ServerSettings:
+    """Make the file of a token one beside the settings file."""
+    if settings.token is None or not settings.token.file:
+        return settings
+    token = Token(file=str(folder / settings.token.file))
+    return msgspec.structs.replace(settings, token=token)
+
+
+def readable(error: Exception) -> str:
+    """Return msgspec's message with the path of the value in front, as we write paths."""
+    text, separator, where = str(error).rpartition(" - at `")
+    if not separator:
+        return str(error)
+    whose, _, path = where.strip("`").rpartition("` in `")
+    return f"{'a key of ' if whose else ''}{path.lstrip('$.')}: {text}"
+
 
 ID_PATTERN = r"^[!-~]{1,512}$"
 """The id of a subscription or a session; CAMARA's are UUIDs."""
@@ -41,71 +236,52 @@ _LARGEST_ANSWER = 4 * 1024 * 1024
 _T = TypeVar("_T")
 
 
-class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """An answer.
+def is_gone(reply: httpx.Response) -> bool:
+    """Whether there is no such thing (any more)."""
+    return reply.status_code in (404, 410)
 
-    Attributes:
-        asked: the request, "GET http://nef.example.net/…".
-        reason: beside the status.
-        body: as far as it was read.
-        headers: by their names in lower case.
+
+def read_answer(reply: httpx.Response, type_: type[_T]) -> _T:
+    """Return the body of an answer, which must be JSON that fits a type.
+
+    Raises:
+        HttpError: it does not. The request may have taken effect.
     """
+    try:
+        return from_json(reply.content, type_, longest=_LARGEST_ANSWER)
+    except ValueError as error:
+        reason = readable(error)
+        at_field = reason != str(error)
+        raise unusable(reply, reason if at_field else f"its body: {reason}") from error
 
-    asked: str
-    status: int
-    reason: str
-    body: bytes
-    headers: Mapping[str, str]
 
-    @property
-    def is_success(self) -> bool:
-        """Whether it was done."""
-        return 200 <= self.status < 300
+def unusable(reply: httpx.Response, reason: str) -> HttpError:
+    """Return the error for an answer that is no use; `reason` names the field first."""
+    return HttpError(
+        f"cannot use the answer {reply.status_code} to {_asked(reply.request)}: {text_of(reason)}",
+        status=reply.status_code,
+        # Whatever the answer is worth, the server has taken the request.
+        uncertain=True,
+        hint="check that the url is that of such a server",
+    )
 
-    @property
-    def gone(self) -> bool:
-        """Whether there is no such thing (any more)."""
-        return self.status in (404, 410)
 
-    def read(self, type_: type[_T]) -> _T:
-        """Return the body, which must be JSON that fits a type.
+def linked(reply: httpx.Response, url: str) -> str:
+    """Return the last path segment of an absolute or relative URL: the id of what it names.
 
-        Raises:
-            HttpError: it does not. The request may have taken effect.
-        """
-        try:
-            return from_json(self.body, type_, longest=_LARGEST_ANSWER)
-        except ValueError as error:
-            reason = readable(error)
-            at_field = reason != str(error)
-            raise self.unusable(reason if at_field else f"its body: {reason}") from error
+    Only the id is taken of a Location: behind a gateway its host is often one that cannot be
+    reached from here, and a token must not follow it.
 
-    def unusable(self, reason: str) -> HttpError:
-        """Return the error for an answer that is no use; `reason` names the field first."""
-        return HttpError(
-            f"cannot use the answer {self.status} to {self.asked}: {text_of(reason)}",
-            status=self.status,
-            # Whatever the answer is worth, the server has taken the request.
-            uncertain=True,
-            hint="check that the url is that of such a server",
-        )
-
-    def linked(self, url: str) -> str:
-        """Return the last path segment of an absolute or relative URL: the id of what it names.
-
-        Only the id is taken of a Location: behind a gateway its host is often one that cannot be
-        reached from here, and a token must not follow it.
-
-        Raises:
-            HttpError: it is no URL, or its end cannot be an id.
-        """
-        try:
-            segment = unquote(urlsplit(url).path.rstrip("/").rpartition("/")[2])
-        except ValueError:
-            segment = ""
-        if segment in (".", "..") or not re.match(ID_PATTERN, segment):
-            raise self.unusable(f"{url[:60]!r} is not a URL that ends in an id")
-        return segment
+    Raises:
+        HttpError: it is no URL, or its end cannot be an id.
+    """
+    try:
+        segment = unquote(urlsplit(url).path.rstrip("/").rpartition("/")[2])
+    except ValueError:
+        segment = ""
+    if segment in (".", "..") or not re.match(ID_PATTERN, segment):
+        raise unusable(reply, f"{url[:60]!r} is not a URL that ends in an id")
+    return segment
 
 
 class _Problem(msgspec.Struct, frozen=True):
@@ -185,7 +361,7 @@ class Api:
         body: Mapping[str, object] | None = None,
         *,
         may_be_gone: bool = False,
-    ) -> Reply:
+    ) -> httpx.Response:
         """Ask, and ask again where that is right; always back by the deadline.
 
         429 and 503 are asked again after Retry-After; 409 too, because a server may still be
@@ -232,13 +408,13 @@ class Api:
                 self.pause(pause_s)
                 wait_s, attempt = wait_s * 2, attempt + 1
 
-    def _attempt(self, request: httpx.Request, *, may_be_gone: bool) -> Reply:
+    def _attempt(self, request: httpx.Request, *, may_be_gone: bool) -> httpx.Response:
         """Ask once.
 
         Raises:
             HttpError: refused, or there is no answer that can be read; says whether to ask again.
         """
-        what = f"{request.method} {request.url}"
+        what = _asked(request)
         limit_s = min(self._timeout_s, self.patience.left_s())
         if limit_s <= 0:
             raise HttpError(f"cannot {what}: {self._why_late()}")
@@ -266,13 +442,13 @@ class Api:
             # Never its own message, which may quote the request.
             reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
         else:
-            if reply.is_success or (may_be_gone and reply.gone):
+            if reply.is_success or (may_be_gone and is_gone(reply)):
                 return reply
-            raise self._refusal(reply, request.method)
+            raise self._refusal(reply)
         again = request.method in _IDEMPOTENT or not sent
         raise HttpError(f"cannot {what}: {reason}", uncertain=sent, again=again)
 
-    async def _ask(self, request: httpx.Request) -> Reply:
+    async def _ask(self, request: httpx.Request) -> httpx.Response:
         """Send a request and read its answer, of which no more than can be of use.
 
         Raises:
@@ -291,21 +467,22 @@ class Api:
                         break
             finally:
                 await answer.aclose()
-        return Reply(
-            asked=f"{request.method} {request.url}",
-            status=answer.status_code,
-            reason=answer.reason_phrase,
-            body=bytes(body),
+        return httpx.Response(
+            answer.status_code,
             headers=answer.headers,
+            content=bytes(body),
+            request=request,
+            extensions=answer.extensions,
         )
 
     def _why_late(self) -> str:
         ended = self.patience.cancelled.is_set()
         return "it was ended before it was done" if ended else "no time left"
 
-    def _refusal(self, answer: Reply, method: str) -> HttpError:
+    def _refusal(self, answer: httpx.Response) -> HttpError:
+        status = answer.status_code
         try:
-            found = from_json(answer.body, _Problem, longest=_LARGEST_ANSWER)
+            found = from_json(answer.content, _Problem, longest=_LARGEST_ANSWER)
         except ValueError:
             found = _Problem()
         # Some servers quote the credentials that they refuse.
@@ -315,20 +492,24 @@ class Api:
             return next(filter(None, (text_of(each, secret) for each in values)), "")
 
         words = [
-            f"{answer.status} {text_of(answer.reason, secret)}".strip(),
+            f"{status} {text_of(answer.reason_phrase, secret)}".strip(),
             first(found.cause, found.code),
             first(found.detail, found.message, found.title),
         ]
-        lost, twice = answer.status in _PASSING, method in _IDEMPOTENT
-        forbidden = answer.status in (401, 403)
+        lost, twice = status in _PASSING, answer.request.method in _IDEMPOTENT
+        forbidden = status in (401, 403)
         return HttpError(
-            f"cannot {answer.asked}: {': '.join(filter(None, words))}",
-            status=answer.status,
+            f"cannot {_asked(answer.request)}: {': '.join(filter(None, words))}",
+            status=status,
             uncertain=lost and not twice,
-            again=answer.status in _ALWAYS_AGAIN or (lost and twice),
+            again=status in _ALWAYS_AGAIN or (lost and twice),
             after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.patience.now_s()),
             hint="check the token and what it is allowed to do" if forbidden else "",
         )
+
+
+def _asked(request: httpx.Request) -> str:
+    return f"{request.method} {request.url}"
 
 
 def as_segment(identifier: str) -> str:

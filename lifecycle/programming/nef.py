@@ -11,15 +11,26 @@ import contextlib
 import ipaddress
 import re
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec import to_builtins
 from msgspec.structs import replace
 
-from lifecycle.programming.http import Reply, as_segment, text_of
+from lifecycle.programming.http import (
+    ServerSettings,
+    as_segment,
+    is_gone,
+    linked,
+    read_answer,
+    text_of,
+    unusable,
+)
 from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
 from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
-from lifecycle.programming.settings import ServerSettings
+
+if TYPE_CHECKING:
+    import httpx
 
 _FIXED = ("ueIpv4Addr", "ueIpv6Addr")
 """What no PUT may change: another device needs another subscription."""
@@ -131,20 +142,20 @@ class NefTarget(ServerTarget):
         shown = _shown(reply)
         made = reply.headers.get("location") or shown.link
         if not made:
-            raise reply.unusable("it has neither a Location nor a self")
-        return Made(id=reply.linked(made), detail=_refused(shown))
+            raise unusable(reply, "it has neither a Location nor a self")
+        return Made(id=linked(reply, made), detail=_refused(shown))
 
     def look(self, id_: str, body: Body) -> Made | None:
         """GET it, or all of ours."""
         path = self.path(id_) if id_ else self.collection
         reply = self._api.request("GET", path, may_be_gone=True)
-        if reply.gone:
+        if is_gone(reply):
             return None
         if id_:
             return Made(id=id_, differs=_differs(body, _shown(reply)))
-        for each in reply.read(tuple[_Subscription, ...]):
+        for each in read_answer(reply, tuple[_Subscription, ...]):
             if each.link and not _differs(body, each, missing=True):
-                return Made(id=reply.linked(each.link))
+                return Made(id=linked(reply, each.link))
         return None
 
     def update(self, id_: str, before: Body, body: Body) -> Made:
@@ -152,18 +163,18 @@ class NefTarget(ServerTarget):
         if any(before.get(key) != body.get(key) for key in _FIXED):
             return super().update(id_, before, body)
         reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
-        if reply.gone:
+        if is_gone(reply):
             return self.create(body)
         return Made(id=id_, detail=_refused(_shown(reply)))
 
 
-def _shown(reply: Reply) -> _Subscription:
+def _shown(reply: httpx.Response) -> _Subscription:
     """Return what an answer shows; it may be without a body.
 
     Raises:
         HttpError: a field is not what the interface has there.
     """
-    return reply.read(_Subscription) if reply.body else _Subscription()
+    return read_answer(reply, _Subscription) if reply.content else _Subscription()
 
 
 def _refused(subscription: _Subscription) -> str:

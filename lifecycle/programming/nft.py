@@ -12,20 +12,21 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import describe
-from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
-from lifecycle.programming.tables import (
+from lifecycle.programming.host import (
+    HostTool,
     Placed,
     TableTarget,
     Wanted,
     chain_line,
     flow_match,
     network_of,
+    qdiscs,
     render_table,
     table_name,
 )
+from lifecycle.programming.ledger import TargetRecord
+from lifecycle.programming.rules import FlowRule, named
 from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
-from lifecycle.programming.tool import HostTool, qdiscs
 
 _BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
 _BLIND = "does not look at DSCP"

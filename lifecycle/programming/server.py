@@ -22,10 +22,16 @@ from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
-from lifecycle.programming.http import Api, as_segment, text_of
+from lifecycle.programming.http import (
+    Api,
+    IpNetwork,
+    ServerSettings,
+    as_segment,
+    load_settings,
+    text_of,
+)
 from lifecycle.programming.ledger import Entry, TargetRecord
 from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
-from lifecycle.programming.settings import IpNetwork, ServerSettings, load_settings
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,

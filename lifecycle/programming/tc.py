@@ -28,19 +28,22 @@ import msgspec
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
-from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
-from lifecycle.programming.tables import (
+from lifecycle.programming.host import (
+    HostTool,
     Placed,
+    Qdisc,
     TableTarget,
     Wanted,
     chain_line,
+    demand,
     flow_match,
+    qdiscs,
     render_table,
     table_name,
 )
+from lifecycle.programming.ledger import TargetRecord
+from lifecycle.programming.rules import FlowRule, named
 from lifecycle.programming.target import Means, ProgrammingError
-from lifecycle.programming.tool import HostTool, Qdisc, demand, qdiscs
 
 OWNED_HANDLE = "1f10:"
 """The root qdisc with this handle is ours, whichever device it is on."""

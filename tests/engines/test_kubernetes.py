@@ -136,7 +136,7 @@ def podman(image: Path, tmp_path: Path, lifecycle_domain: int) -> Iterator[Calla
     (tmp_path / "system/kube.lifecycle.yaml").write_text(yaml.safe_dump(manifest))
     with tarfile.open(image, "a") as archive:
         archive.add(tmp_path / "system/kube.lifecycle.yaml", "./system/kube.lifecycle.yaml")
-    lifecycle = (sys.executable, "-m", "lifecycle.cli")
+    lifecycle = (sys.executable, "-m", "lifecycle")
     _run(
         *(*lifecycle, "export", "kubernetes", tmp_path / "system/kube.lifecycle.yaml"),
         *("--image", "localhost/robot", "-o", tmp_path),

@@ -136,7 +136,7 @@ class Machine:
 
     def status(self) -> Any:
         """Return what `lifecycle status` says there to root."""
-        words = ("-m", "lifecycle.cli", "status", "units", "--format", "json")
+        words = ("-m", "lifecycle", "status", "units", "--format", "json")
         command = self.command("env", "-C", str(ROOT), sys.executable, *words)
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.stdout, done.stderr
@@ -166,7 +166,7 @@ def machines(tmp_path: Path, lifecycle_domain: int) -> Iterator[tuple[Machine, M
         (system / "units.lifecycle.yaml").write_text(yaml.safe_dump(manifest))
         subprocess.run(
             [
-                *(sys.executable, "-m", "lifecycle.cli", "export", "systemd"),
+                *(sys.executable, "-m", "lifecycle", "export", "systemd"),
                 *(system / "units.lifecycle.yaml", "-o", tmp_path / "units"),
                 *("--at", "/run/system/units.lifecycle.yaml"),
                 *("--program", Path(sys.executable).with_name("lifecycle")),

@@ -176,7 +176,7 @@ def started(
     """Start a verb in a process of its own; yield it and its mark, and end whatever it left."""
     mark = uuid.uuid4().hex
     process = subprocess.Popen(
-        [*through, sys.executable, "-m", "lifecycle.cli", *words],
+        [*through, sys.executable, "-m", "lifecycle", *words],
         cwd=ROOT,
         env={**environment(runtime, mark), **(variables or {})},
         start_new_session=True,

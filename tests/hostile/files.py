@@ -215,7 +215,7 @@ def _settings(make: Make, place: Place) -> None:
     words = ("flows", "remove", str(folder / "m.lifecycle.yaml"))
     check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder)}))
     from lifecycle.errors import LifecycleError
-    from lifecycle.programming.settings import load_settings
+    from lifecycle.programming.http import load_settings
 
     try:
         load_settings(folder / "targets.json")

@@ -24,11 +24,11 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
+from lifecycle.programming.host import HostTool, qdiscs
+from lifecycle.programming.http import load_settings
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget
-from lifecycle.programming.settings import load_settings
 from lifecycle.programming.target import Means, ProgrammingError
-from lifecycle.programming.tool import HostTool, qdiscs
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer
 from lifecycle.supervisor.core.state import Order

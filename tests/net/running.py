@@ -114,7 +114,7 @@ def run_directory(runtime: Path, machine: str) -> Path:
 def verb_on(host: Host, *words: str, runtime: Path) -> subprocess.CompletedProcess[str]:
     """Run a verb on a host to its end."""
     return subprocess.run(
-        host.command(sys.executable, "-m", "lifecycle.cli", *words),
+        host.command(sys.executable, "-m", "lifecycle", *words),
         cwd=ROOT,
         env=host.environment(runtime),
         capture_output=True,

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.programming.host import HostTool
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import ChangeKind, Means, ProgrammingError
-from lifecycle.programming.tool import HostTool
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
 

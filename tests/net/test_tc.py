@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.programming.host import HostTool, Output
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import ChangeKind, Means, ProgrammingError, TargetChanges
 from lifecycle.programming.tc import TcSettings, TcTarget
-from lifecycle.programming.tool import HostTool, Output
 from tests.net.hosts import Host
 from tests.unit.programming.samples import ledger_in, rule
 

@@ -29,7 +29,7 @@ WAIT_S = 60
 
 def command(words: list[str], domain_id: int) -> tuple[list[str], dict[str, str]]:
     return (
-        [sys.executable, "-m", "lifecycle.cli", *words[1:]],
+        [sys.executable, "-m", "lifecycle", *words[1:]],
         {**os.environ, "ROS_DOMAIN_ID": str(domain_id), "COLUMNS": "100"},
     )
 

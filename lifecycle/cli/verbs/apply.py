@@ -14,12 +14,12 @@ import msgspec
 
 from lifecycle.cli.common import (
     assignments_argument,
+    completing,
     format_option,
     load_plan,
     machine_option,
     timeout_option,
 )
-from lifecycle.cli.completion import completing
 from lifecycle.codec import Count, says, to_json
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import json_text, lines

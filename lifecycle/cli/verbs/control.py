@@ -15,6 +15,7 @@ import click
 from lifecycle.cli.common import (
     asking,
     assignments_argument,
+    completing,
     format_option,
     machine_option,
     target_argument,
@@ -25,7 +26,6 @@ from lifecycle.cli.common import (
     timeout_option,
     wrapped,
 )
-from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.measure.flows import measured_summary
 from lifecycle.printable import columns, count, json_text, lines, one_line
@@ -217,7 +217,7 @@ def status_command(
 
 
 def _watch(path: Path, format_: str) -> int:
-    from lifecycle.cli.watched import Watched
+    from lifecycle.cli.standard_streams import Watched
     from lifecycle.codec import to_json
     from lifecycle.supervisor.control.server import follow
     from lifecycle.verify.outcome import Outcome

@@ -12,12 +12,11 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import (
     asking,
@@ -31,23 +30,14 @@ from lifecycle.cli.common import (
     read_networks,
     target_argument,
     target_plan,
-    terminal_width,
     timeout_option,
-    wrapped,
 )
-from lifecycle.cli.measured import Record, cells
-from lifecycle.cli.verbs.verify import exit_code
-from lifecycle.cli.watched import Watched
-from lifecycle.codec import to_json
+from lifecycle.cli.flow_tables import Record, render_flows, watched_flows
+from lifecycle.cli.report import exit_code
+from lifecycle.cli.standard_streams import Watched
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import UniqueHow
-from lifecycle.measure.flows import FlowMeasurement, measured_summary
-from lifecycle.network.dscp import describe, dscp_name
-from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.printable import columns, count, json_text, lines, one_line, shown_length
-from lifecycle.programming.flows_csv import flows_to_csv
-from lifecycle.programming.names import TARGETS
-from lifecycle.verify.outcome import Outcome
+from lifecycle.printable import count, lines
+from lifecycle.programming import TARGETS
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
@@ -55,129 +45,6 @@ if TYPE_CHECKING:
     from lifecycle.programming.programmer import Programmer
     from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen, TargetChanges
-    from lifecycle.supervisor.run.looking import JudgedSystem
-    from lifecycle.verify.verdict import Verdict
-
-_MEASURED = ("Hz", "p50 ms", "p99 ms", "lost")
-_NONE = ("",) * len(_MEASURED)
-_HEADS = (
-    "topic",
-    "publisher",
-    "subscription",
-    *("rate_hz", "p50_ms", "p99_ms", "lost"),
-    "source",
-    "destination",
-    "protocol",
-    "flow_label",
-    "dscp",
-    "5qi",
-    "unique",
-    "required",
-    "demanded",
-    "transport",
-    "verdict",
-)
-_UNIQUE = {UniqueHow.NOT: "no", UniqueHow.WEAKLY: "weakly", UniqueHow.STRONGLY: "strongly"}
-
-
-def render_flows(
-    flows: Sequence[FlowReport],
-    format_: str,
-    measured: Sequence[FlowMeasurement] = (),
-    *,
-    colour: bool = False,
-) -> str:
-    """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
-
-    In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
-    its `tuples`. `transport` is what carries it, not what could. In JSON `measured` is null where
-    nothing was.
-    """
-    found = {each.pair: each for each in measured}
-    flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
-    if format_ == "json":
-        documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
-        return json_text(to_json(documents).decode())
-    if format_ == "csv":
-        return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
-    if not flows:
-        return "no flow"
-    rows = (row for each in flows for row in _rows(each, found.get(each.pair), colour=colour))
-    return "\n".join(columns([_HEADS, *rows]))
-
-
-def watched_flows(verdict: Verdict, format_: str) -> str:
-    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first."""
-    width = terminal_width()
-    if format_ != "text" or not width:
-        return render_flows(verdict.flows, format_, verdict.measured)
-    from lifecycle.cli.up_output import verdict_line
-
-    found, names = {each.pair: each for each in verdict.measured}, _short_names(verdict.flows)
-    rows = [("verdict", *(_MEASURED if found else _NONE), "unique", "dscp", "transport", "flow")]
-    outcomes = [(_outcome(each, found.get(each.pair)), each) for each in verdict.flows]
-    for outcome, flow in sorted(outcomes, key=lambda each: each[0] is Outcome.OK):
-        numbers = cells(found.get(flow.pair), colour=True) if found else _NONE
-        unique = "unknown" if flow.unique is None else _UNIQUE[flow.unique]
-        dscp = "–" if flow.dscp is None else dscp_name(flow.dscp)
-        name = f"{flow.topic} {names[flow.publisher]} → {names[flow.subscription]}"
-        rest = (unique, dscp, flow.effective_transport, one_line(name))
-        rows.append((outcome.value, *numbers, *rest))
-    if max(map(shown_length, columns(rows))) > width:
-        rows = [(*row[:5], row[-1]) for row in rows]
-    head = filter(None, (verdict_line(verdict), measured_summary(verdict.measured)))
-    return "\n".join((wrapped(map(one_line, head), width), *columns(rows, width=width)))
-
-
-def _short_names(flows: Sequence[FlowReport]) -> dict[str, str]:
-    """Return nodes' names without their namespaces, where no other node has the same."""
-    names = {name for flow in flows for name in (flow.publisher, flow.subscription)}
-    short = {name: name.rpartition("/")[2] for name in names}
-    taken = [*short.values()]
-    return {name: each if taken.count(each) == 1 else name for name, each in short.items()}
-
-
-def _outcome(flow: FlowReport, measured: FlowMeasurement | None) -> Outcome:
-    """Return how a flow is, with what has arrived of it."""
-    found = [flow.outcome]
-    if measured is not None and measured.outcome in ("violated", "unverifiable"):
-        found.append(Outcome(measured.outcome))
-    return Outcome.worst(found)
-
-
-def _rows(
-    flow: FlowReport, measured: FlowMeasurement | None, *, colour: bool
-) -> Iterator[tuple[str, ...]]:
-    # What the data carry, and where that is known what the subscription acknowledges with.
-    dscp = "–" if flow.dscp is None else describe(flow.dscp)
-    dscp += "" if flow.reader_dscp is None else f"; back {describe(flow.reader_dscp)}"
-    five_qi = "–" if flow.five_qi is None else str(flow.five_qi)
-    demands_and_verdict = (
-        dscp,
-        f"{five_qi} (auto)" if flow.five_qi_reason else five_qi,
-        "unknown" if flow.unique is None else _UNIQUE[flow.unique],
-        " / ".join(each.value for each in flow.requirement),
-        flow.demanded.value,
-        flow.effective_transport,
-        flow.outcome.value,
-    )
-    for each in _tuples(flow):
-        pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))
-        yield (*pair, *cells(measured, colour=colour), *rest)
-
-
-def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
-    """Source, destination, protocol and flow label of each network flow of a pair."""
-    found = [
-        (each.source, each.destination, each.transport_protocol.value, each.label or "–")
-        for each in flow.tuples
-    ]
-    return found or [(_ends(flow.source), _ends(flow.destination), "–", "–")]
-
-
-def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
-    """Write the network flow endpoints of an end that forms no IP flow with the other."""
-    return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
 def export(

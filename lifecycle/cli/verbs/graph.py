@@ -19,7 +19,7 @@ from lifecycle.cli.common import (
     timeout_option,
     write_text,
 )
-from lifecycle.cli.watched import Watched
+from lifecycle.cli.standard_streams import Watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 

@@ -11,8 +11,7 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import load_manifest
-from lifecycle.cli.completion import completing
+from lifecycle.cli.common import completing, load_manifest
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware.fastdds.discovery import peers_environment

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lifecycle.cli.common import (
+    completing,
     format_option,
     load_manifest,
     machine_option,
@@ -15,7 +16,6 @@ from lifecycle.cli.common import (
     read_networks,
     timeout_option,
 )
-from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.errors import ExitCode
 

@@ -47,7 +47,7 @@ def test_each_step_of_the_page_does_what_it_says(tmp_path: Path, fresh_domain: i
             if program != "lifecycle":
                 continue
             result = subprocess.run(
-                [sys.executable, "-m", "lifecycle.cli", *options],
+                [sys.executable, "-m", "lifecycle", *options],
                 cwd=tmp_path if options[0] == "init" else root,
                 env=environment,
                 capture_output=True,

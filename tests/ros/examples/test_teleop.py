@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Events, dict[str, obj
     with output.open("wb") as stream:
         up = subprocess.Popen(
             [
-                *(sys.executable, "-m", "lifecycle.cli", "up"),
+                *(sys.executable, "-m", "lifecycle", "up"),
                 *("manifests/teleop.lifecycle.yaml", "--format", "json"),
             ],
             cwd=ROOT,

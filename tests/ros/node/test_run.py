@@ -59,7 +59,7 @@ def neighbour(fresh_domain: int) -> Iterator[Driver]:
 
 
 def lifecycle_run(start: Start, *arguments: str) -> subprocess.Popen[str]:
-    return start("-m", "lifecycle.cli", "run", *arguments)
+    return start("-m", "lifecycle", "run", *arguments)
 
 
 def read_until(process: subprocess.Popen[str], last: str) -> list[str]:

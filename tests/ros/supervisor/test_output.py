@@ -348,7 +348,7 @@ def test_the_exit_code_of_a_verb_does_not_depend_on_who_reads_it(tmp_path: Path)
     wrong.write_text("manifest_version: 1\nsystem: 7\n")
 
     def code(words: str, *arguments: str) -> tuple[int, str]:
-        script = f"exec {sys.executable} -m lifecycle.cli {words}"
+        script = f"exec {sys.executable} -m lifecycle {words}"
         done = subprocess.run(
             ["sh", "-c", script, "sh", *arguments],
             cwd=ROOT,
@@ -372,7 +372,7 @@ def test_the_exit_code_of_a_verb_does_not_depend_on_who_reads_it(tmp_path: Path)
         os.close(read)
         with os.fdopen(write, "wb") as broken:
             done = subprocess.run(
-                ["sh", "-c", f"exec {sys.executable} -m lifecycle.cli {words}", "sh", str(wrong)],
+                ["sh", "-c", f"exec {sys.executable} -m lifecycle {words}", "sh", str(wrong)],
                 cwd=ROOT,
                 env=environment(tmp_path, ""),
                 stdout=broken,

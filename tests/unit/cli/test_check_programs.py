@@ -94,7 +94,7 @@ def test_a_report_is_written_by_its_suffix_on_every_exit_code(
 
 def test_up_refuses_before_it_starts_anything(folder: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "lifecycle.cli", "up", "Talkr.lifecycle.yaml"],
+        [sys.executable, "-m", "lifecycle", "up", "Talkr.lifecycle.yaml"],
         cwd=folder,
         capture_output=True,
         text=True,

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from lifecycle.cli.verbs import flows as verb
 from lifecycle.cli.verbs import up
-from lifecycle.programming.names import TARGETS
+from lifecycle.programming import TARGETS
 from lifecycle.programming.programmer import read_treatment
 from lifecycle.programming.target import read_targets
 from lifecycle.verify.verdict import FlowReport

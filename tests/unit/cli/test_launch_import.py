@@ -88,7 +88,7 @@ sys.exit(service.run())
 
 
 def _lifecycle(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return _python(folder, "-m", "lifecycle.cli", *words)
+    return _python(folder, "-m", "lifecycle", *words)
 
 
 def _python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -166,7 +166,7 @@ def test_a_launch_file_starts_a_manifest(tmp_path: Path) -> None:
     )
     result = _python(tmp_path, "-c", START)
     output = result.stdout + result.stderr
-    assert "lifecycle.cli up a.lifecycle.yaml rate:=5" in output or "exit code 3" in output, output
+    assert "lifecycle up a.lifecycle.yaml rate:=5" in output or "exit code 3" in output, output
     assert "a.lifecycle.yaml:1:1: cannot open 'a.lifecycle.yaml'" in output
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.cli.measured import COLUMNS, Record, bar, cells
-from lifecycle.cli.verbs import flows as flows_verb
-from lifecycle.cli.verbs.flows import watched_flows
+from lifecycle.cli import flow_tables
+from lifecycle.cli.flow_tables import RECORDED, Record, bar, cells, watched_flows
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import FlowMeasurement, Kind, MeasuredBound, measured_summary
@@ -101,7 +100,7 @@ def flow_of(measurement: FlowMeasurement, outcome: Outcome = Outcome.OK) -> Flow
 
 def shown(monkeypatch: pytest.MonkeyPatch, *flows: FlowMeasurement, width: int = 80) -> list[str]:
     """The rows of `flows --watch` on a terminal, without colours."""
-    monkeypatch.setattr(flows_verb, "terminal_width", lambda: width)
+    monkeypatch.setattr(flow_tables, "terminal_width", lambda: width)
     unmeasured = measured(topic="/robot/cmd_vel", to="/robot/health")
     verdict = replace(
         verdict_of(Outcome.VIOLATED),
@@ -170,7 +169,7 @@ def test_a_summary_counts_the_flows_with_declared_numbers_and_names_the_worst_fi
 def test_a_record_has_a_row_for_each_flow_that_is_on_disk_at_once(tmp_path: Path) -> None:
     path = tmp_path / "flows.csv"
     record = Record(path, replaces=False)
-    assert path.read_text() == ",".join(COLUMNS) + "\n"
+    assert path.read_text() == ",".join(RECORDED) + "\n"
     unknown = replace(measured(), lost=None, p50_ms=None, p99_ms=None)
     record.add([measured(LATE, LOSES), unknown])
     rows = list(csv.DictReader(path.read_text().splitlines()))
@@ -194,7 +193,7 @@ def test_a_record_replaces_a_file_only_if_asked_and_says_why_it_cannot_be_writte
         Record(path, replaces=False)
     assert path.read_text() == "kept"
     Record(path, replaces=True).close()
-    assert path.read_text() == ",".join(COLUMNS) + "\n"
+    assert path.read_text() == ",".join(RECORDED) + "\n"
     with pytest.raises(UsageError, match=r"cannot write .*/none/flows.csv': No such file"):
         Record(tmp_path / "none" / "flows.csv", replaces=False)
     with pytest.raises(UsageError, match="cannot write '/dev/full': No space left on device"):

@@ -17,7 +17,7 @@ PROGRAM = """
 import time
 
 from lifecycle.cli import main
-from lifecycle.cli.watched import Watched
+from lifecycle.cli.standard_streams import Watched
 
 # Wide characters, and what is too wide and too long for the terminal.
 text = "\\n".join(f"{number:3} " + "界" * 60 + "." * 60 for number in range(1, 101))

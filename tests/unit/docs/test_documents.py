@@ -227,7 +227,7 @@ def test_the_node_of_its_page_fits_its_manifest(tmp_path: Path) -> None:
     (manifest,) = blocks(page, "yaml")
     (tmp_path / "bump_counter.py").write_text(f"{node}\n{alone}", encoding="utf-8")
     (tmp_path / "bumps.lifecycle.yaml").write_text(manifest, encoding="utf-8")
-    check = [sys.executable, "-m", "lifecycle.cli", "check", "--strict", "bumps.lifecycle.yaml"]
+    check = [sys.executable, "-m", "lifecycle", "check", "--strict", "bumps.lifecycle.yaml"]
     result = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.stdout == "bumps: 1 node, 3 endpoints, 0 links: ok\n"
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "E9,F", "."]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from lifecycle.programming.host import Output
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import ChangeKind, FlowChange, ProgrammingError, TargetChanges
-from lifecycle.programming.tool import Output
 
 
 class FakeTarget:

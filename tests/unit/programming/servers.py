@@ -24,7 +24,7 @@ from openapi_core.datatypes import RequestParameters
 from openapi_core.exceptions import OpenAPIError
 from werkzeug.datastructures import Headers, ImmutableMultiDict
 
-from lifecycle.programming.patience import Patience
+from lifecycle.programming.target import Patience
 
 CAMARA = Path(__file__).parents[2] / "data" / "camara" / "quality-on-demand.yaml"
 TOKEN = "s3cr3t-t0ken-0f-the-t3sts"

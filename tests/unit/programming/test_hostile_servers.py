@@ -17,14 +17,13 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import BringUpError
-from lifecycle.programming.http import Api
-from lifecycle.programming.patience import Patience
+from lifecycle.programming.http import Api, ServerSettings
 from lifecycle.programming.programmer import Programmer
-from lifecycle.programming.settings import ServerSettings
 from lifecycle.programming.target import (
     HttpError,
     Means,
     PartlyError,
+    Patience,
     SettingsError,
     Target,
     read_targets,

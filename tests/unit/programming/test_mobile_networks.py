@@ -16,9 +16,9 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.programming.camara import CamaraSettings, CamaraTarget
+from lifecycle.programming.http import ServerSettings
 from lifecycle.programming.nef import NefSettings, NefTarget
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.settings import ServerSettings
 from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO, rule
 from tests.unit.programming.samples import exported, settings_file
 

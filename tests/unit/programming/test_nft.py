@@ -10,9 +10,9 @@ from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import MAX_DSCP
+from lifecycle.programming.host import MAX_COMMENT_BYTES, render_table_removal, table_name
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.tables import MAX_COMMENT_BYTES, render_table_removal, table_name
 from tests.unit.programming.flow_samples import (
     EXPECTED,
     LEFT_OUT,

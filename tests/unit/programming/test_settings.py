@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import UsageError
+from lifecycle.programming.http import Token, load_settings
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.nef import NefSettings
-from lifecycle.programming.settings import Token, load_settings
 from lifecycle.programming.target import Means, SettingsError, read_targets, target_kind
 from tests.unit.programming.samples import camara_settings, ledger_in, nef_settings, settings_file
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.programming.host import HostTool, Output, demand
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.target import (
     ChangeKind,
@@ -18,7 +19,6 @@ from lifecycle.programming.target import (
     TargetChanges,
 )
 from lifecycle.programming.tc import parse_queue, parse_rate
-from lifecycle.programming.tool import HostTool, Output, demand
 from tests.unit.programming.fakes import FakeTool, failed, printed
 from tests.unit.programming.samples import ledger_in, rule
 

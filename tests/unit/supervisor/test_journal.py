@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
-from lifecycle.cli.verbs import history
+from lifecycle.cli.verbs.logs import history_command
 from lifecycle.errors import UsageError
 from lifecycle.supervisor.run.events import Notice, Stopped, VerdictChanged
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
@@ -101,20 +101,20 @@ def test_the_verbs_tell_a_run_whose_supervisor_was_killed(kept: Kept) -> None:
     kept.journal.on_event(Notice(message="about /camera\x1b[2J"))
     kept.journal.on_event(Notice(message="about /camera_2"))
     folder = str(kept.directory)
-    code, text = _verb(history.command, folder)
+    code, text = _verb(history_command, folder)
     assert code == 0
     assert "robot: 2 nodes in 2 processes" in text.splitlines()[0]
     assert text.splitlines()[-1].endswith("ended without saying so")
     said = [line.split("  ")[-1] for line in text.splitlines() if "about" in line]
     assert said == ["about /camera\\x1b[2J", "about /camera_2"]
-    code, text = _verb(history.command, folder, "--format", "json")
+    code, text = _verb(history_command, folder, "--format", "json")
     assert text.splitlines() == (kept.directory / "journal.jsonl").read_text().splitlines()
 
 
 def test_below_a_verdict_are_the_findings_that_came_and_went(kept: Kept) -> None:
     for each in (VERDICT, VERDICT, replace(VERDICT, verdict=verdict_of(Outcome.OK))):
         kept.journal.on_event(each)
-    text = _verb(history.command, str(kept.directory))[1]
+    text = _verb(history_command, str(kept.directory))[1]
     assert [line for line in text.splitlines() if line.startswith("    ")] == [
         "    + violated graph.missing-node: graph.missing-node /camera",
         "    - violated graph.missing-node: /camera",
@@ -123,7 +123,7 @@ def test_below_a_verdict_are_the_findings_that_came_and_went(kept: Kept) -> None
 
 def test_a_journal_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="cannot find a journal"):
-        _verb(history.command, str(tmp_path))
+        _verb(history_command, str(tmp_path))
     (tmp_path / "journal.jsonl").write_text("hello\n")
     with pytest.raises(UsageError, match="no line says of which run"):
-        _verb(history.command, str(tmp_path))
+        _verb(history_command, str(tmp_path))

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.cli.flow_tables import render_flows, watched_flows
 from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, TerminalLines
 from lifecycle.cli.verbs.control import status_text
-from lifecycle.cli.verbs.flows import render_flows, watched_flows
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, UniqueHow
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
@@ -282,7 +282,7 @@ def test_a_status_is_a_head_a_line_for_each_node_and_its_connections_below_it() 
 def test_a_status_and_flows_fit_a_terminal_and_say_what_is_wrong_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("lifecycle.cli.verbs.flows.terminal_width", lambda: 80)
+    monkeypatch.setattr("lifecycle.cli.flow_tables.terminal_width", lambda: 80)
     why = "wrong: " + ", ".join(f"/robot/topic_{number} (qos.incompatible)" for number in range(9))
     said = status_text(replace(STATUS, not_ok=why), width=80).splitlines()
     flows = (FLOW, replace(FLOW, outcome=Outcome.VIOLATED))

@@ -7,10 +7,10 @@ import io
 
 from msgspec.structs import replace
 
+from lifecycle.cli.flow_tables import COLUMNS, flows_to_csv
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement
 from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
-from lifecycle.programming.flows_csv import COLUMNS, flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 from tests.builders import nfe

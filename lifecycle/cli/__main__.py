@@ -1,7 +1,0 @@
-"""`python -m lifecycle.cli`."""
-
-import sys
-
-from lifecycle.cli import program
-
-sys.exit(program())
