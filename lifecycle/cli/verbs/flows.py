@@ -41,10 +41,12 @@ from lifecycle.programming import TARGETS
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
+    from lifecycle.measure.flows import FlowMeasurement
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
     from lifecycle.programming.rules import Treatment
     from lifecycle.programming.target import Chosen, TargetChanges
+    from lifecycle.supervisor.run.looking import JudgedSystem
 
 
 def export(
