@@ -37,7 +37,7 @@ from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.health.peers import Peers
+from lifecycle.supervisor.nodes.peers import Peers
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.verify.observation import (
     EndpointReport,

@@ -250,8 +250,8 @@ class RunDirectory:
         `processes` are those of it that run already, names by pid.
 
         Raises:
-            UsageError: another supervisor has it, or the directory belongs to another user, is writable by others, or cannot be
-                made or written.
+            UsageError: another supervisor has it, or the directory belongs to another user, is
+                writable by others, or cannot be made or written.
         """
         directory = cls(root / name, run_id, domain_id)
         try:

@@ -307,7 +307,7 @@ def target_run(
     """
     path, plan = target_plan(environment, target, assignments, machine)
     if plan is not None:
-        from lifecycle.supervisor.control.client import differences
+        from lifecycle.supervisor.control.protocol import differences
 
         if found := differences(path, plan):
             listed = "\n".join(found)

@@ -1,6 +1,6 @@
-"""The asyncio loop in which a graph runs, and a wait that loses no cancellation.
+"""The asyncio loop in which a graph runs, and waits that lose no cancellation.
 
-Owns: where callbacks of a graph are called, one after another. Pure.
+Owns: where callbacks of a graph are called, one after another; `set_within`, `ended`, `within`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ import asyncio
 import contextlib
 import threading
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
 
 @typing.final
@@ -97,3 +98,51 @@ async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:
     finally:
         waiting.cancel()
     return bool(done)
+
+
+T = TypeVar("T")
+
+_AGAIN_S = 5.0
+"""Far longer than any task takes to notice that it was cancelled, also on a loaded machine."""
+
+_TIMES = 6
+"""A task that does not end then is left behind: nobody may wait for it for ever."""
+
+
+async def ended(*tasks: asyncio.Future[Any]) -> None:
+    """Cancel tasks and wait until each has ended, however it did, also if this is cancelled.
+
+    They are cancelled again, bounded: asyncio.wait_for of Python 3.10 and 3.11 may take a
+    cancellation for the end of its wait (python/cpython#86296).
+    """
+    cancelled: asyncio.CancelledError | None = None
+    for _ in range(_TIMES):
+        if not (left := [each for each in tasks if not each.done()]):
+            break
+        for each in left:
+            each.cancel()
+        try:
+            await asyncio.wait(left, timeout=_AGAIN_S)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    await asyncio.gather(*(each for each in tasks if each.done()), return_exceptions=True)
+    if cancelled is not None:
+        raise cancelled
+
+
+async def within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
+    """Carry something out in a task of its own, for so long; nothing of it runs on afterwards.
+
+    asyncio.wait_for gives up what it waits for if it is cancelled a second time.
+
+    Raises:
+        asyncio.TimeoutError: it took longer.
+    """
+    task = asyncio.ensure_future(work)
+    try:
+        done, _ = await asyncio.wait((task,), timeout=seconds)
+    finally:
+        await ended(task)
+    if not task.done() or (not done and task.cancelled()):
+        raise asyncio.TimeoutError
+    return task.result()

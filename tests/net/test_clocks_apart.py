@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.control.client import look
+from lifecycle.supervisor.control.protocol import look
 from lifecycle.verify.verdict import FlowMeasurement
 from tests.net.hosts import Host
 from tests.net.other_clock import OtherClock

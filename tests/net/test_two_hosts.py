@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.control.client import down, status
+from lifecycle.supervisor.control.protocol import down, status
 from tests.net.hosts import Host, Hosts
 from tests.net.running import UNIQUE, article, run_directory, up_on, up_on_both
 from tests.ros.supervisor.running import BOUND_S, ROOT, Up

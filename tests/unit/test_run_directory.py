@@ -32,13 +32,13 @@ from lifecycle.run_directory import (
     start_ticks,
 )
 from lifecycle.supervisor.control import protocol
-from lifecycle.supervisor.control.client import status
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ControlRequest,
     Question,
     SystemStatus,
     ask,
+    status,
 )
 from lifecycle.supervisor.control.server import ControlServer, follow
 from tests.builders import plan_of, planned_node

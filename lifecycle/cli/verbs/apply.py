@@ -164,7 +164,7 @@ def _is_by(path: Path, plan: Plan) -> bool:
     """Whether a run is of a system of the same name, or began with the same file."""
     if path.name.rpartition("@")[0] == plan.system:
         return True
-    from lifecycle.supervisor.control.client import status
+    from lifecycle.supervisor.control.protocol import status
 
     try:
         manifest = status(path).manifest
@@ -174,8 +174,7 @@ def _is_by(path: Path, plan: Plan) -> bool:
 
 
 def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: float) -> Answer:
-    from lifecycle.supervisor.control.client import order
-    from lifecycle.supervisor.control.protocol import ControlRequest, Question
+    from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
     try:

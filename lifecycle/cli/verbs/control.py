@@ -201,7 +201,7 @@ def status_command(
     from lifecycle.codec import to_json
 
     # takes long to import, and a wrong name needs none
-    from lifecycle.supervisor.control.client import status
+    from lifecycle.supervisor.control.protocol import status
     from lifecycle.verify.outcome import Outcome
 
     with asking(path):
@@ -279,8 +279,7 @@ def _give_order(
         path = target_run(os.environ, target, assignments, machine)
     else:
         path, plan = target_plan(os.environ, target, assignments, machine)
-    from lifecycle.supervisor.control.client import order
-    from lifecycle.supervisor.control.protocol import ControlRequest, Question
+    from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
     try:
@@ -313,7 +312,7 @@ def down_command(
     supervisor itself was killed, what it left behind is ended too.
     """
     path = target_run(os.environ, target, assignments, machine)
-    from lifecycle.supervisor.control.client import down
+    from lifecycle.supervisor.control.protocol import down
 
     try:
         return down(path, timeout)

@@ -363,7 +363,7 @@ def _record(plan: Plan, record: Record, for_s: float | None) -> int:
 
 
 def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
-    from lifecycle.supervisor.control.client import status
+    from lifecycle.supervisor.control.protocol import status
 
     began_s = time.monotonic()
     for number in itertools.count():
@@ -386,7 +386,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
     if is_manifest(target) or target.endswith((".yaml", ".yml")):
         return load_plan(target, assignments)
-    from lifecycle.supervisor.control.client import look
+    from lifecycle.supervisor.control.protocol import look
 
     path, _ = target_plan(os.environ, target, assignments, "")
     with asking(path):

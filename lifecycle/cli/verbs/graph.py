@@ -60,7 +60,7 @@ def command(
             f"cannot print one {format_} picture after another", hint="give --output FILE"
         )
     path, plan = _found(target, assignments, machine)
-    from lifecycle.supervisor.control.client import look
+    from lifecycle.supervisor.control.protocol import look
     from lifecycle.supervisor.run import looking
 
     with Watched(whole=watch and output is None and format_ == "text") as shown:

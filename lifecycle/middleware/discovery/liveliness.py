@@ -10,7 +10,7 @@ thread, which would assert an AUTOMATIC writer, stands still while a leaving pee
 Beside which nodes are silent, a notice says when its sender received the last one of each other
 supervisor. So two of them exchange the four timestamps by which their clocks are compared
 (lifecycle.measure.clock): Fast DDS takes them where it sends and receives. It says on which ports
-its sender receives marked datagrams, too (lifecycle.supervisor.health.marks).
+its sender receives marked datagrams, too (lifecycle.supervisor.nodes.marks).
 
 `PlanNotices` is the topic on which supervisors of one domain publish their plans, to detect
 conflicts. Its name holds no system: a supervisor that was started with another manifest must be

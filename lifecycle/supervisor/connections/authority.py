@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
+from lifecycle.graph.loop import ended, set_within, within
 from lifecycle.manifest.model import After, Authority, Condition, DataLayerSource, Readiness
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import Plan, PlannedNode
@@ -39,7 +39,6 @@ from lifecycle.supervisor.nodes.driver import (
 )
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
-from lifecycle.supervisor.run.failure import ended, within
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 

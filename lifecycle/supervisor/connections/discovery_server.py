@@ -13,6 +13,7 @@ import signal
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.graph.loop import within
 from lifecycle.manifest.model import Run, RunKind
 from lifecycle.middleware.discovery.discovery_server import (
     discovery_server_command,
@@ -23,7 +24,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding

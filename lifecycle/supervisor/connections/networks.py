@@ -13,15 +13,16 @@ import asyncio
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.graph.loop import set_within
+from lifecycle.graph.loop import ended, set_within
+from lifecycle.middleware.process.control import no_room_for_threads
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
-from lifecycle.supervisor.run.failure import Worker, ended
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import FlowReport, Verdict
 
@@ -54,6 +55,9 @@ class Networks:
         directory: of the run.
         emit: where notices go, and where verdicts come from.
         programmer: None programs nothing.
+
+    Raises:
+        MiddlewareError: no thread can be started.
     """
 
     def __init__(
@@ -68,8 +72,12 @@ class Networks:
         self._changed = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
         self._one_at_a_time = asyncio.Lock()  # the programmer is of one thread
-        # Made here: in the end it may be too late to start a thread.
-        self._worker = Worker("networks")
+        # A thread that is started at once: in the end there may be no room for one.
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="networks")
+        try:
+            self._thread.submit(int)
+        except RuntimeError as error:
+            raise no_room_for_threads(1) from error
         if programmer is not None:
             emit.listen(self._hear)
 
@@ -125,12 +133,13 @@ class Networks:
         """Remove everything, in the thread and within CLOSE_S for all servers together."""
         is_late = hurry.is_set()
         within_s = _HURRIED_S if is_late else CLOSE_S
-        removing = asyncio.ensure_future(
-            self._worker.run(functools.partial(removes.close, within_s=within_s))
-        )
+        loop = asyncio.get_running_loop()
+        remove = functools.partial(removes.close, within_s=within_s)
+        removing = loop.run_in_executor(self._thread, remove)
         if not is_late:
             hurried = asyncio.ensure_future(hurry.wait())
-            await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)
+            either: set[asyncio.Future[Any]] = {removing, hurried}
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
             await ended(hurried)
             if not removing.done():
                 removes.cancel()
@@ -191,8 +200,7 @@ class Networks:
             loop.call_soon_threadsafe(self._report, text)
 
         async with self._one_at_a_time:
-            work = self._worker.run(_once, programmer, self._flows, within_s, say)
-            task = asyncio.ensure_future(work)
+            task = loop.run_in_executor(self._thread, _once, programmer, self._flows, within_s, say)
             try:
                 return await asyncio.shield(task)
             except asyncio.CancelledError:

@@ -1,6 +1,10 @@
 """The supervisor's control socket: what `lifecycle status`, `down`, `pause` and others ask.
 
-Owns: listening, answering, and following what a supervisor knows; what is asked and answered is
+Owns: listening, answering, and following what a supervisor knows; and `check`: of an order that
+names a manifest, is it the one that runs, and can it be taken meanwhile? An order with a plan that
+is not the one that runs is refused unless it says to take it, and so is, with the reason, what
+cannot be changed while the supervisor runs. Which orders fit what the system is doing, and what
+they do, is the core's, what differs `plan.comparison`'s; what is asked and answered is
 protocol.py's. Must not import rclpy.
 """
 
@@ -9,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +21,9 @@ import msgspec
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import ExitCode, UsageError
+from lifecycle.network.connection_url import parse
+from lifecycle.plan.build import with_files_of_now
+from lifecycle.plan.comparison import PlanDifference, changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import connect, short_path
 from lifecycle.supervisor.control.protocol import (
@@ -27,12 +34,18 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
     read_answer,
 )
+from lifecycle.supervisor.core.change import change_to
+from lifecycle.supervisor.core.orders import SAID, restarted
+from lifecycle.supervisor.core.state import Order
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.run.options import local_processes
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.core.state import Order
     from lifecycle.supervisor.shell.supervisor import Supervisor
+
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0
@@ -191,3 +204,146 @@ def follow(path: Path) -> Iterator[SupervisorSnapshot]:
         while (answer := read_answer(path, sock, rest, None, LookAnswer)) is not None:
             if answer.look is not None:
                 yield answer.look
+
+
+_CHANGEABLE = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
+"""Parts of a manifest that a running supervisor can change: the rest made the supervisor's own
+participant, its authority and the networks that it programs."""
+_NOT_CHANGEABLE = ("policy.ros_interface",)
+
+
+def check(order: Order, system: System, machine: str) -> None:
+    """Make sure that nothing but the manifest that an order means will run.
+
+    Args:
+        order: which.
+        system: what runs.
+        machine: of its supervisor, as it was given to `lifecycle up`.
+
+    Raises:
+        UsageError: the manifest has changed since the start, or cannot be taken.
+    """
+    running = system.first
+    if order.ask is ControlRequest.APPLY:
+        if order.plan is None or not order.timeout_s >= 0:
+            raise UsageError(
+                f"cannot apply a manifest to {running.system!r} without one, or within "
+                f"{order.timeout_s:g} s"
+            )
+        _check_apply(order.plan, system, machine)
+    elif order.plan is not None:
+        found = changes(running, order.plan)
+        if found and order.ask is not ControlRequest.PAUSE:
+            raise _refused(order, system, found)
+    elif order.ask is ControlRequest.RESTART:
+        keys = restarted(system.run, order)
+        found = changes(running, with_files_of_now(running))
+        if found := tuple(each for each in found if each.node in keys):
+            raise _refused(order, system, found)
+
+
+def _refused(order: Order, system: System, found: Iterable[PlanDifference]) -> UsageError:
+    name = system.plan.system
+    what, said = order.ask.value, SAID.get(order.ask, order.ask.value)
+    listed = "\n".join(difference_lines(found))
+    path = (order.plan or system.first).manifest_path
+    take = f"lifecycle apply {path}"
+    same = f"; or keep what runs: lifecycle {what} {name}" if order.plan is not None else ""
+    same = f"{same} {order.mode}" if same and order.mode else same
+    return UsageError(
+        f"cannot {said} {name!r}: its manifest is not the one that runs:\n{listed}\n"
+        f"take the new one: {take}{same}"
+    )
+
+
+def _check_apply(plan: Plan, system: System, machine: str) -> None:
+    """Make sure that the running system can become that of another plan."""
+    running = system.first
+    what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
+    if not _is_whole(plan):
+        raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")
+    change = change_to(system.run, plan)
+    # Whoever has other ports by that has other connections, too, and is started again.
+    found = tuple(each for each in change.differences if each.path != "order of nodes")
+    _check_surroundings(plan, running, found, what)
+    if system.remote or len(local_processes(plan, machine)) < len(plan.processes):
+        raise _refused_whole(
+            what, "nodes on other machines run by it, too:", difference_lines(found)
+        )
+    urls = [*_urls(running), *_urls(plan)]
+    if change.ends_or_starts and any(parse(url).transport.is_tcp for url in urls):
+        raise _refused_whole(
+            what, "a TCP port that was used is not connected to again by who used it"
+        )
+    for key in (*change.restarted, *change.removed):
+        if (name := system.nodes[key].name) in system.run.adopted:
+            raise UsageError(
+                f"{what}: {name!r} would be taken down, and was adopted",
+                hint="who started it ends it; then lifecycle down, and lifecycle up",
+            )
+
+
+def _check_surroundings(
+    plan: Plan, running: Plan, found: tuple[PlanDifference, ...], what: str
+) -> None:
+    """Make sure that another plan is for the same supervisor, in the same surroundings."""
+    elsewhere = any(each.path.startswith("discovery.") for each in found)
+    fixed = [
+        *difference_lines(
+            each
+            for each in found
+            if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
+        ),
+        *(() if elsewhere else _places(running, plan)),
+    ]
+    if fixed:
+        raise _refused_whole(what, "a running supervisor cannot change this:", fixed)
+    if (running.observers, running.server) != (plan.observers, plan.server):
+        raise _refused_whole(what, "its supervisor would be connected otherwise")
+
+
+def _is_whole(plan: Plan) -> bool:
+    """Whether a plan, which a client sent, names no nodes but its own, each once."""
+    nodes = {each.key: each.process for each in plan.nodes}
+    placed = [(key, each.name) for each in plan.processes for key in each.nodes]
+    named = {after.node for each in plan.nodes for after in each.after}
+    named.update(key for flow in plan.flows for key in (flow.publisher, flow.subscription))
+    named.update(key for level in plan.levels for key in level)
+    named.update(key for mode in plan.modes for key in mode.inactive)
+    return (
+        len(nodes) == len(plan.nodes) == len({each.full_name for each in plan.nodes})
+        and sorted(placed) == sorted(nodes.items())
+        and named <= nodes.keys()
+    )
+
+
+def _refused_whole(what: str, why: str, lines: Iterable[str] = ()) -> UsageError:
+    listed = "".join(f"\n{each}" for each in lines)
+    return UsageError(
+        f"{what}: {why}{listed}",
+        hint="end it and start it anew: lifecycle down, then lifecycle up",
+    )
+
+
+def _places(running: Plan, plan: Plan) -> Iterator[str]:
+    """Yield how the environments differ in which two plans were made that declare the same."""
+    for what, old, new in (
+        ("ROS_DOMAIN_ID", running.domain_id, plan.domain_id),
+        (
+            "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            running.discovery_range.name,
+            plan.discovery_range.name,
+        ),
+        ("RMW_IMPLEMENTATION", running.rmw, plan.rmw),
+    ):
+        if old != new:
+            yield f"{what}: was {old}, is {new}"
+
+
+def _urls(plan: Plan) -> Iterator[str]:
+    for _, connections in plan.observers:
+        yield from connections.urls
+    for node in plan.nodes:
+        yield from node.connections.urls
+        for each in node.participants:
+            yield from each.connections.urls

@@ -25,13 +25,13 @@ from lifecycle.plan.parameters import DEFAULT
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
 from lifecycle.supervisor.core.state import Level, Node, Run, new_run
-from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
     ControlDriver,
     NodeDriver,
 )
+from lifecycle.supervisor.nodes.liveliness import SilenceMonitor
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s

@@ -100,7 +100,7 @@ _CLOSE_S = 1.0
 _MAIN = "lifecycle.supervisor.processes.fork_server_main"
 
 _OF_SERVICE_MANAGER = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""The supervisor's own, run/service_manager.py: a node that has them could report in its place."""
+"""The supervisor's own, run/journal.py: a node that has them could report in its place."""
 
 _CHANGES = os.WNOHANG | os.WUNTRACED | os.WCONTINUED
 _WAKEUP_BYTES = 4096

@@ -1,20 +1,17 @@
-"""A failed step of bring-up as a finding; how a run ended; tasks that end when they are to.
+"""A failed step of bring-up as a finding, and how a run ended.
 
-Owns: `StepFailedError`, how failures join a verdict, so that every run ends in one verdict that
-names each cause once; `ended`, `within`; and `Worker`, a thread for what blocks.
+Owns: `StepFailedError`, and how failures join a verdict, so that every run ends in one verdict that
+names each cause once.
 """
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Collection, Coroutine, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode
-from lifecycle.middleware.process.control import no_room_for_threads
 from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
@@ -109,78 +106,3 @@ def _gone(system: System, failures: Iterable[Failure]) -> frozenset[str]:
     """Return the names of the nodes that are not there any more, as their process has ended."""
     processes = {each.process for each in failures if each.rule in _ENDED and each.process}
     return frozenset(node.name for name in processes for node in system.carried_by(name))
-
-
-T = TypeVar("T")
-
-_AGAIN_S = 5.0
-"""Far longer than any task takes to notice that it was cancelled, also on a loaded machine."""
-
-_TIMES = 6
-"""A task that does not end then is left behind: nobody may wait for it for ever."""
-
-
-async def ended(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel tasks and wait until each has ended, however it did, also if this is cancelled.
-
-    They are cancelled again, bounded: asyncio.wait_for of Python 3.10 and 3.11 may take a
-    cancellation for the end of its wait (python/cpython#86296).
-    """
-    cancelled: asyncio.CancelledError | None = None
-    for _ in range(_TIMES):
-        if not (left := [each for each in tasks if not each.done()]):
-            break
-        for each in left:
-            each.cancel()
-        try:
-            await asyncio.wait(left, timeout=_AGAIN_S)
-        except asyncio.CancelledError as error:
-            cancelled = error
-    await asyncio.gather(*(each for each in tasks if each.done()), return_exceptions=True)
-    if cancelled is not None:
-        raise cancelled
-
-
-async def within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
-    """Carry something out in a task of its own, for so long; nothing of it runs on afterwards.
-
-    asyncio.wait_for gives up what it waits for if it is cancelled a second time.
-
-    Raises:
-        asyncio.TimeoutError: it took longer.
-    """
-    task = asyncio.ensure_future(work)
-    try:
-        done, _ = await asyncio.wait((task,), timeout=seconds)
-    finally:
-        await ended(task)
-    if not task.done() or (not done and task.cancelled()):
-        raise asyncio.TimeoutError
-    return task.result()
-
-
-class Worker:
-    """A thread for what blocks, one thing after the other.
-
-    It is started at once: a system that has reached its limit of processes and threads must still
-    be taken down (asyncio's own executor starts a thread when it is used, and one to end).
-
-    Raises:
-        MiddlewareError: no thread can be started.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix=name)
-        try:
-            self._executor.submit(int)
-        except RuntimeError as error:
-            raise no_room_for_threads(1) from error
-
-    async def run(self, work: Callable[..., T], *arguments: object) -> T:
-        """Do `work` in the thread, and return what it returns."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._executor, work, *arguments)
-
-    def close(self) -> None:
-        """Finish what is under way, and end the thread."""
-        self._executor.shutdown()

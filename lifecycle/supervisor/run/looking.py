@@ -32,11 +32,10 @@ from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import expected_by_onlooker, is_negotiated
-from lifecycle.supervisor.control.client import look
+from lifecycle.supervisor.control.protocol import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
-from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
-from lifecycle.supervisor.health.liveliness import not_answering
+from lifecycle.supervisor.nodes.liveliness import ANSWER_S, TRIES, not_answering
 from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.supervisor.shell.grace_period import GracePeriod

@@ -73,7 +73,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended_early
-from lifecycle.supervisor.run.journal import Journal
+from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     Until,
     UpOptions,
@@ -83,7 +83,6 @@ from lifecycle.supervisor.run.options import (
     observer_connections,
     own_machines,
 )
-from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 
@@ -134,8 +133,7 @@ def up(
 
     Raises:
         UsageError: another supervisor has this system in this domain, the plan has nothing for
-            this host, the run directory or the options of a
-            network to program cannot be used.
+            this host, the run directory or the options of a network to program cannot be used.
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
     """

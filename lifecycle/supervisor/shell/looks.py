@@ -22,8 +22,8 @@ from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
-from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.nodes.liveliness import arrivals
 from lifecycle.supervisor.nodes.system import reached
 from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.shell.grace_period import GracePeriod

@@ -24,7 +24,6 @@ from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
 from lifecycle.supervisor.core.state import NEVER_S, REACHES, Level, Request, Step
-from lifecycle.supervisor.nodes.adoption import ran_before
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
@@ -35,6 +34,7 @@ from lifecycle.supervisor.nodes.driver import (
     NodeCondition,
     Permit,
     ServiceDriver,
+    ran_before,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError

@@ -18,6 +18,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
+from lifecycle.graph.loop import ended
 from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
@@ -27,20 +28,18 @@ from lifecycle.supervisor.connections.authority import (
     configured_before_any_connect,
 )
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.orders import check
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
-from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
+from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check
 from lifecycle.supervisor.control.status import process_state, system_status
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import STARTS, refused_at_once
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.health.answering import Answering
-from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.peers import FAILED, Peers
-from lifecycle.supervisor.nodes.adoption import adopt
+from lifecycle.supervisor.nodes.driver import adopt
+from lifecycle.supervisor.nodes.liveliness import Answering, Cause
+from lifecycle.supervisor.nodes.peers import FAILED, Peers
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.fork_server import reap_adopted
 from lifecycle.supervisor.run.events import (
@@ -51,7 +50,7 @@ from lifecycle.supervisor.run.events import (
     ProcessChanged,
     Stopped,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, ended, result_of
+from lifecycle.supervisor.run.failure import StepFailedError, result_of
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks

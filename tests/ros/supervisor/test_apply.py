@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.control.client import status as ask_status
 from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.protocol import status as ask_status
 from lifecycle.verify.outcome import Outcome
 from tests.ros.supervisor.running import Up, pair, up, verb
 

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import UniqueHow, UniqueRequirement
 from lifecycle.plan.model import Plan, PlannedFlow
-from lifecycle.supervisor.health import marks as module
-from lifecycle.supervisor.health.marks import Marks, carries_marks
+from lifecycle.supervisor.nodes import marks as module
+from lifecycle.supervisor.nodes.marks import Marks, carries_marks
 from lifecycle.verify.observation import ArrivedMark
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport

@@ -17,7 +17,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     VerdictChanged,
 )
-from lifecycle.supervisor.run.service_manager import ServiceManager
+from lifecycle.supervisor.run.journal import ServiceManager
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
 from tests.unit.supervisor.fakes import run_started, verdict_of

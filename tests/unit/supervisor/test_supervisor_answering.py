@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import BringUpError
+from lifecycle.graph.loop import ended
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.core.state import Level
-from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
 from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, ServiceDriver
+from lifecycle.supervisor.nodes.liveliness import ANSWER_S, SHOWN_S, TRIES, Answering
 from lifecycle.supervisor.run.events import Notice
-from lifecycle.supervisor.run.failure import ended
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeForkServer, World
 from tests.unit.supervisor.session_world import FakeParticipant

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.graph.loop import ended
 from lifecycle.manifest.model import Condition, Machine
-from lifecycle.supervisor.run.failure import ended
 from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.supervisor.shell.looks import conditions
 from lifecycle.verify.observation import Observation, ObservedNode

@@ -9,7 +9,7 @@ import pytest
 
 from lifecycle.manifest.model import Timeouts
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
-from lifecycle.supervisor.health.liveliness import Cause, SilenceMonitor
+from lifecycle.supervisor.nodes.liveliness import Cause, SilenceMonitor
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
 from lifecycle.supervisor.run.events import (
     Emitter,

@@ -24,7 +24,7 @@ from lifecycle.programming.target import (
 )
 from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id, run_name
 from lifecycle.supervisor.connections.networks import Networks, open_networks
-from lifecycle.supervisor.control.client import down
+from lifecycle.supervisor.control.protocol import down
 from lifecycle.supervisor.processes.fork_server import reap_adopted
 from lifecycle.supervisor.run.events import Emitter, Notice, VerdictChanged
 from lifecycle.supervisor.run.options import UpOptions

@@ -12,10 +12,8 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Condition, Mode, RunKind
-from lifecycle.supervisor.control.client import look, order
-from lifecycle.supervisor.control.orders import check
-from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
-from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, look, order
+from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check, follow
 from lifecycle.supervisor.core.orders import FITS, refusal
 from lifecycle.supervisor.core.state import Ending, Order, new_run
 from lifecycle.supervisor.run.options import UpOptions

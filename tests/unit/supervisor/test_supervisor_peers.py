@@ -19,8 +19,8 @@ from lifecycle.node.host.control import Operation
 from lifecycle.plan.comparison import decode, encode, notice_of
 from lifecycle.plan.model import Plan, PlannedFlow
 from lifecycle.supervisor.core.state import install
-from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.peers import ANNOUNCED_S, EXCHANGED_S, Peers
+from lifecycle.supervisor.nodes.liveliness import Cause
+from lifecycle.supervisor.nodes.peers import ANNOUNCED_S, EXCHANGED_S, Peers
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import MachineConnection, NodeAlive, NodeSilent
 from lifecycle.verify.observation import Observation, ObservedNode

@@ -27,7 +27,7 @@ from lifecycle.supervisor.control.ros_interface import (
     check_installed,
     diagnostics,
 )
-from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.nodes.liveliness import Cause
 from lifecycle.verify.outcome import Outcome
 from tests import result_schemas
 from tests.unit.supervisor.fakes import verdict_of

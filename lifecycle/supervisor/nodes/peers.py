@@ -33,8 +33,8 @@ from lifecycle.plan.comparison import (
     encode,
     notice_of,
 )
-from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.marks import Marks, carries_marks
+from lifecycle.supervisor.nodes.liveliness import Cause
+from lifecycle.supervisor.nodes.marks import Marks, carries_marks
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.verify.observation import ArrivedMark, Observation

@@ -1,1 +1,0 @@
-"""Liveliness of the processes, nodes and other supervisors of a system."""
