@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.graph.loop import ended, set_within
@@ -133,14 +133,13 @@ class Networks:
         """Remove everything, in the thread and within CLOSE_S for all servers together."""
         is_late = hurry.is_set()
         within_s = _HURRIED_S if is_late else CLOSE_S
-        loop, remove = (
-            asyncio.get_running_loop(),
-            functools.partial(removes.close, within_s=within_s),
-        )
+        loop = asyncio.get_running_loop()
+        remove = functools.partial(removes.close, within_s=within_s)
         removing = loop.run_in_executor(self._thread, remove)
         if not is_late:
             hurried = asyncio.ensure_future(hurry.wait())
-            await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)
+            either: set[asyncio.Future[Any]] = {removing, hurried}
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
             await ended(hurried)
             if not removing.done():
                 removes.cancel()
