@@ -52,7 +52,7 @@ from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import THIS_HOST, Shared, settle
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.arguments import Substituted, substitute
+from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
@@ -274,7 +274,11 @@ class _Loading:
             return
         self._check_suffix(document)
         before = len(self.found)
-        substituted = self._substituted(document, path, given, entry)
+        surroundings = Surroundings(
+            environment=self._environment, folder=folder_of(path), programs=self._programs
+        )
+        substituted = substitute(document, given, surroundings, include=entry)
+        self.found += substituted.found
         document = substituted.document
         emptied = [
             place[:-1]
@@ -285,11 +289,11 @@ class _Loading:
         self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return
-        self._system(document, substituted.arguments)
+        self._system(document, tuple(substituted.arguments.items()))
         for name, each in document.entries("machines"):
             self._machine(name, each)
         first_link = len(self._links)
-        reading = _Reading(chain=(*chain, path), left_out=substituted.left_out)
+        reading = _Reading(chain=(*chain, path), left_out=tuple(substituted.left_out))
         self._contents(reading, document, around, entry)
         links = [self._link(each, around) for each in document.items("links")]
         self._links[first_link:first_link] = links
@@ -321,22 +325,6 @@ class _Loading:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = document.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))
-
-    def _substituted(
-        self,
-        document: Document,
-        path: Path,
-        given: Mapping[str, str],
-        entry: Document | None,
-    ) -> Substituted:
-        surroundings = Surroundings(
-            environment=self._environment,
-            folder=folder_of(path),
-            programs=self._programs,
-        )
-        found = substitute(document, given, surroundings, include=entry)
-        self.found += found.diagnostics
-        return found
 
     def _contents(
         self, reading: _Reading, root: Document, around: Shared, entry: Document | None

@@ -355,10 +355,6 @@ class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
         return _without_last_break(text)
 
 
-NOWHERE = Surroundings(environment={}, folder=os.curdir, programs=None)
-"""For documents that are not of a file."""
-
-
 def folder_of(path: Path) -> str:
     """Return the folder of a file so that a program's working directory does not matter."""
     return os.path.abspath(path.parent)  # noqa: PTH100 - a link stays the path that users know
