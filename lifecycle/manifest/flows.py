@@ -52,12 +52,7 @@ class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def class_of(need: FlowNeed, *, max_delay_ms: float | None) -> FlowClass:
-    """Return the class of one publisher's flow.
-
-    Args:
-        need: what it asks for; a declared `rate_hz` asks for a guaranteed rate.
-        max_delay_ms: declared, else that of its links; None without.
-    """
+    """Return the class of one publisher's flow; the delay is declared, or that of its links."""
     message_bytes = need.max_message_size
     rate_bps = (
         need.rate_hz * message_bytes * 8
@@ -212,11 +207,10 @@ class FlowNeeds:
         """Return the extra participants that a node's endpoints need: as few as meet every need.
 
         A publisher that needs an NFE of its own shares with none. Others share if they ask for the
-        same DSCP, 5QI, transports and way of sending; the smaller datagram size serves both.
-        Subscriptions need one if they are marked, because acknowledgements leave by the sockets of
-        the participant; they share it with those of the same DSCP and transports, not with
-        publishers: a network that looks at marks must not take the one for the other's flow. Within
-        one node only: a participant belongs to a node, whose hidden node is what the graph shows.
+        same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
+        acknowledgements leave by the sockets of the participant; they never share with publishers,
+        whose flow a network that looks at marks must not take theirs for. Within one node only: a
+        participant belongs to a node, whose hidden node is what the graph shows.
         """
         found: dict[object, ParticipantGroup] = {}
         own = (None, None, self.node_transports(node), False)

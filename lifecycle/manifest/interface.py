@@ -63,12 +63,7 @@ _DEFAULT_PRESET = {
 
 
 def build_inline(interface: Document, found: Findings) -> Interface:
-    """Build an interface that is written out.
-
-    Args:
-        interface: a mapping that fits the schema's `interface`.
-        found: findings are appended here.
-    """
+    """Build an interface that is written out: a mapping that fits the schema's `Interface`."""
     endpoints = []
     for kind in EndpointKind:
         first: dict[str, Document] = {}
@@ -201,8 +196,7 @@ def read_interface(
         environment: for AMENT_PREFIX_PATH; this process's if None.
 
     Returns:
-        The interface, with `source` set, and every finding. After an error the interface holds
-        what could be read.
+        The interface as far as it could be read, and every finding.
     """
     reading = _NodlReading(search_prefixes(environment))
     reading.follow(reference, Path(base), at, ())
@@ -406,10 +400,7 @@ class _NodlReading:
 
 
 def nearest_file(path: Path) -> str:
-    """Return a hint that names the file, beside one that is missing, with the nearest name.
-
-    Only files of the same kind count, and only up to the first dot, where kinds begin.
-    """
+    """Return a hint that names the file of the same kind with the nearest name in that folder."""
     stem, _, kind = path.name.partition(".")
     files = [each.name.partition(".") for each in path.parent.glob(f"*.{kind}")]
     stems = {each: f"{each}{dot}{rest}" for each, dot, rest in files if rest == kind}

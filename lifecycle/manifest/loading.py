@@ -143,7 +143,7 @@ class ArgumentDeclaration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
-    """Return the arguments that one manifest declares, in their order, whatever else is in it.
+    """Return the arguments that one manifest declares, whatever else is in it.
 
     Raises:
         ManifestError: it cannot be read, or its `arguments:` are none.
@@ -474,7 +474,7 @@ MAX_MANIFESTS = 256
 
 
 def _shown(path: Path) -> str:
-    """Return how messages name a file: bytes that are no UTF-8 could be neither _shown nor sent."""
+    """Return how messages name a file: bytes that are no UTF-8 could be neither shown nor sent."""
     return os.fsencode(path).decode("utf-8", errors="replace")
 
 
@@ -487,13 +487,7 @@ def _identity(path: Path) -> str:
 
 
 def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
-    """Return the file that an entry of `include:` names; None after reporting why there is none.
-
-    Args:
-        entry: the entry.
-        chain: the including manifests, outermost first.
-        found: findings are appended here.
-    """
+    """Return the file that an entry of `include:` names; None after reporting why there is none."""
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
     identities = [_identity(each) for each in chain]

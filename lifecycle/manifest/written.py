@@ -120,8 +120,7 @@ def read_special(type_: type, value: object) -> object:
     """Return what msgspec has no types for: a type that holds itself, a choice of two mappings.
 
     Raises:
-        msgspec.ValidationError: the value does not fit.
-        ValueError: likewise.
+        ValueError: the value does not fit.
     """
     if type_ is ParameterTree:
         return ParameterTree(msgspec.convert(value, TREE, dec_hook=read_special))
@@ -140,10 +139,10 @@ def read_special(type_: type, value: object) -> object:
 
 
 def read(plain: object, type_: type[T], *, strict: bool = True) -> T:
-    """Return a part of a document as its type.
+    """Return a part of a document, with substitutions resolved, as its type.
 
     Args:
-        plain: lists, mappings and scalars, substitutions resolved.
+        plain: lists, mappings and scalars.
         type_: what the part must be.
         strict: whether 5.0 is refused where an integer must be.
 
@@ -161,10 +160,7 @@ def read_part(document: Document, type_: type[T], place: Place = ()) -> T:
 def build(type_: type[B], section: Struct, /, **computed: Any) -> B:
     """Return what the model has of a section: the fields of the same name, and those computed.
 
-    Args:
-        type_: a type of `model`; what is not written (None) keeps its default there.
-        section: as it is written.
-        computed: fields that are more than the value of their key.
+    What is not written (None) keeps the default of the model's type.
     """
     for name in type_.__struct_fields__:
         value = getattr(section, name, None)

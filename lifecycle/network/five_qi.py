@@ -104,15 +104,7 @@ def check_class(
     rate_bps: float | None = None,
     message_bytes: int | None = None,
 ) -> tuple[ClassIssue, ...]:
-    """Return what a flow declares and the class does not keep; empty if it keeps all.
-
-    Args:
-        class_: the 5QI that the flow asks for.
-        max_delay_ms: declared bound of the delay, > 0, against the packet delay budget.
-        loss: declared bound of the loss, 0–1, against the packet error rate.
-        rate_bps: bits per second, > 0, against the type and the data burst volume.
-        message_bytes: largest message, > 0, against the data burst volume.
-    """
+    """Return what a flow declares and the class does not keep; empty if it keeps all."""
     found: list[ClassIssue] = []
 
     def issue(field: str, message: str) -> None:
@@ -172,7 +164,7 @@ def propose(
         loss: bound of the loss, > 0 and <= 1.
         gbr: True asks for a guaranteed bit rate, False for none, None for either.
         message_bytes: largest message that must arrive within the delay, > 0.
-        rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
+        rate_bps: bits per second that must be guaranteed, > 0.
     """
     fitting = [
         each

@@ -102,11 +102,7 @@ class PortUse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def domain_base(domain_id: int) -> int:
-    """Return the first port of a domain, which is its discovery multicast port.
-
-    Raises:
-        ValueError: not 0–232.
-    """
+    """Return the first port of a domain, its discovery multicast port; ValueError beyond 0–232."""
     if not 0 <= domain_id <= MAX_DOMAIN_ID:
         raise ValueError(
             f"cannot use domain id {domain_id}: its ports would lie outside 1 to {MAX_PORT}; "
@@ -147,10 +143,7 @@ def participant_ports(domain_id: int, participant_id: int) -> ParticipantPorts:
 def unicast_pairs(
     domain_id: int, participants: int = PARTICIPANTS_PER_DOMAIN
 ) -> list[tuple[int, int]]:
-    """Return the ports for discovery and user data of the first participants of one host.
-
-    As many as exist: the highest domain has fewer.
-    """
+    """Return the ports for discovery and user data of the first participants of one host."""
     first = participant_ports(domain_id, 0)
     between = first.user_unicast - first.discovery_unicast
     end = min(first.discovery_unicast + PG * participants, MAX_PORT + 1 - between)
@@ -175,11 +168,7 @@ def owner_of(port: int) -> PortUse | None:
 def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
     """Return what else the unicast ports of this participant belong to, in the domains above.
 
-    Empty up to participant 119. Participant 120 of domain d overlaps with the multicast ports of
-    domain d + 1.
-
-    Raises:
-        ValueError: as `participant_ports`.
+    Empty up to participant 119; that after it has the multicast ports of the next domain.
     """
     ports = participant_ports(domain_id, participant_id)
     uses = (owner_of(ports.discovery_unicast), owner_of(ports.user_unicast))

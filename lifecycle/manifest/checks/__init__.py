@@ -38,9 +38,6 @@ def check(
         environment: for AMENT_PREFIX_PATH, ROS_DOMAIN_ID, RMW_IMPLEMENTATION and
             FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
         files: parameter files of its nodes that were read already.
-
-    Returns:
-        Every error and warning, in the order of their places in each document.
     """
     system = DeclaredSystem.of(
         manifest,

@@ -1,10 +1,9 @@
 """Launch-like arguments of a manifest, substitutions in its values, and `if:` and `unless:`.
 
-Owns: where argument values are taken from: given as `name:=value`, else the default; which nodes,
-includes and groups a document leaves out by their conditions, whose other substitutions are then
-not looked at; what a value becomes. What is inside `$(…)` is `substitutions`'. A substitution never
-adds structure: its text is never parsed as YAML again, it only takes the type of a scalar where it
-is one whole unquoted value.
+Owns: where argument values are taken from; which nodes, includes and groups a document leaves out
+by their conditions, whose other substitutions are then not looked at; what a value becomes. A
+substitution never adds structure: its text only takes the type of a scalar where it is one whole
+unquoted value.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ def substitute(
     """Resolve a document's arguments, then every substitution in its values.
 
     Args:
-        document: as read, not yet validated; what is malformed in `arguments:` is passed over, the
-            schema reports it.
+        document: as read; what is malformed in its `arguments:` is left to the schema.
         given: values by argument name, from the command line or from an including manifest.
         surroundings: what substitutions read from outside.
         include: the entry of the including manifest that gives the values.
@@ -174,10 +172,7 @@ class Substituted:
         self.found.append(warning("manifest.command-not-run", at, problem.message, problem.hint))
 
     def _conditions(self, value: Value, place: Place) -> Value | None:
-        """Return what has `if:` or `unless:` with their values; None if it is left out.
-
-        Where one cannot be read it is `broken`.
-        """
+        """Return a value with its conditions read, which may be `broken`; None if left out."""
         if not isinstance(value.data, Mapping):
             return value
         written = [key for key in CONDITIONS if key in value.data]
