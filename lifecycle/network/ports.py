@@ -193,22 +193,22 @@ def max_participants(domain_id: int, ephemeral: EphemeralRange) -> Capacity:
 
 
 def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
-    """Return the domain ids whose first participant is clear of the ephemeral ports, as runs.
-
-    0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
-    """
-    domains = range(MAX_DOMAIN_ID + 1)
-    safe = {each for each in domains if max_participants(each, ephemeral).participants}
-    first = [each for each in domains if each in safe and each - 1 not in safe]
-    last = [each for each in domains if each in safe and each + 1 not in safe]
-    return tuple(range(one, other + 1) for one, other in zip(first, last, strict=True))
+    """Return the domain ids whose first participant is clear of the ephemeral ports, as runs."""
+    found: list[range] = []
+    for domain in range(MAX_DOMAIN_ID + 1):
+        if not max_participants(domain, ephemeral).participants:
+            continue
+        if found and found[-1].stop == domain:
+            found[-1] = range(found[-1].start, domain + 1)
+        else:
+            found.append(range(domain, domain + 1))
+    return tuple(found)
 
 
 def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
     """Return this machine's real ephemeral range (ip(7), ip_local_port_range).
 
-    Args:
-        read: returns the text of a file by its path; injected, so that this room opens nothing.
+    `read` returns the text of a file, so that this room opens nothing.
 
     Raises:
         OSError: `read` could not; not Linux, or no /proc.
