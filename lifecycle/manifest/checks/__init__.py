@@ -39,7 +39,7 @@ def check(
             FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
         files: parameter files of its nodes that were read already.
     """
-    system = DeclaredSystem.of(
+    system = DeclaredSystem(
         manifest,
         environment=os.environ if environment is None else environment,
         files=files or ParameterFiles(manifest.path),

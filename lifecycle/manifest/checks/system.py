@@ -1,10 +1,9 @@
 """The manifest as the checks read it: endpoints with fully qualified names, implicit ones included.
 
-Owns: resolving all names once, so that each check compares fully qualified names; an endpoint whose
-name cannot be resolved is left out here and reported by `names`. The names of the endpoints that
-every ROS 2 node, or every managed one, has without declaring them, so that what connects to them is
-not reported as unconnected. Sources: rcl's rosout and type description service, rclpy's parameter
-services, rcl_lifecycle's services and event. Pure.
+Owns: resolving all names once; an endpoint whose name cannot be resolved is reported by `names`.
+The names of the endpoints that every ROS 2 node, or every managed one, has without declaring them
+(rcl's rosout and type description service, rclpy's parameter services, rcl_lifecycle's services and
+event), so that what connects to them is not reported as unconnected. Pure.
 """
 
 from __future__ import annotations
@@ -64,44 +63,33 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
-class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+class DeclaredSystem:
     """A manifest and what follows from it alone.
 
     Attributes:
-        endpoints: in the order of the manifest.
+        endpoints: in the order of the manifest; by remap rules that rcl reads.
         unresolved: those that have no name, and why.
         environment: of the process that will run the system.
         files: the parameter files that nodes name.
     """
 
-    manifest: Manifest
-    environment: Mapping[str, str]
-    files: ParameterFiles
-    endpoints: tuple[Resolved, ...]
-    unresolved: tuple[tuple[Node, Endpoint, LifecycleError], ...]
-
-    @classmethod
-    def of(
-        cls, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
-    ) -> DeclaredSystem:
-        """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
-        resolved: list[Resolved] = []
-        unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
+    def __init__(
+        self, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
+    ) -> None:
+        self.manifest = manifest
+        self.environment = environment
+        self.files = files
+        self.endpoints: list[Resolved] = []
+        self.unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
         for node in manifest.nodes:
             as_read = replace(node, remap=usable_rules(node))
             for endpoint in node.interface.endpoints:
-                name = _name(as_read, endpoint)
-                if isinstance(name, str):
-                    resolved.append(Resolved(node=node, endpoint=endpoint, name=name))
+                try:
+                    name = name_in_graph(as_read, endpoint.name, endpoint.kind)
+                except LifecycleError as problem:  # noqa: PERF203 - each is reported
+                    self.unresolved.append((node, endpoint, problem))
                 else:
-                    unresolved.append((node, endpoint, name))
-        return cls(
-            manifest=manifest,
-            environment=environment,
-            files=files,
-            endpoints=tuple(resolved),
-            unresolved=tuple(unresolved),
-        )
+                    self.endpoints.append(Resolved(node=node, endpoint=endpoint, name=name))
 
     @functools.cached_property
     def prefixes(self) -> tuple[Path, ...]:
@@ -147,14 +135,7 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     def names(self, kind: EndpointKind) -> tuple[str, ...]:
         """Return the fully qualified names that endpoints of one kind have."""
-        return self._names.get(kind, ())
-
-    @functools.cached_property
-    def _names(self) -> dict[EndpointKind, tuple[str, ...]]:
-        grouped: dict[EndpointKind, list[str]] = {}
-        for kind, name in self.by_name:
-            grouped.setdefault(kind, []).append(name)
-        return {kind: tuple(names) for kind, names in grouped.items()}
+        return tuple(name for of, name in self.by_name if of is kind)
 
     @functools.cached_property
     def is_open(self) -> bool:
@@ -162,13 +143,6 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return self.manifest.policy.undeclared_nodes is EndpointPolicy.OPEN or any(
             node.endpoints is EndpointPolicy.OPEN for node in self.manifest.nodes
         )
-
-
-def _name(node: Node, endpoint: Endpoint) -> str | LifecycleError:
-    try:
-        return name_in_graph(node, endpoint.name, endpoint.kind)
-    except LifecycleError as problem:
-        return problem
 
 
 def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
