@@ -48,7 +48,6 @@ from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.document import Document, quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
-_KINDS = {kind.value: kind for kind in EndpointKind}
 
 
 def build_on_violation(section: Document) -> OnViolation:
@@ -115,7 +114,7 @@ def _map(connection: Document, interface: Interface) -> tuple[tuple[EndpointKind
     if connection.text("map") == "all":
         return tuple((each.kind, each.name) for each in interface.endpoints)
     return tuple(
-        (_KINDS[kind], each.root.text)
+        (EndpointKind(kind), each.root.text)
         for kind, names in connection.entries("map")
         for each in names.items()
     )

@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 from lifecycle.manifest.model import (
     RULES_AND_FAMILIES,
     WORD,
+    Condition,
     DataLayer,
     Discovery,
     Dscp,
@@ -480,9 +481,6 @@ InterfaceReference = Annotated[
 ]
 
 
-Level = Literal["started", "configured", "connected", "active", "healthy"]
-"""What a node may be waited for to be (`model.Condition`)."""
-
 Names = Text | Annotated[tuple[Text, ...], Meta(min_length=1)]
 
 
@@ -606,7 +604,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     parameter_files: tuple[Text, ...] = ()
     remap: dict[Text, Text] = field(default_factory=dict)
-    after: dict[NodeKey, Level | Ready] = field(default_factory=dict)
+    after: dict[NodeKey, Condition | Ready] = field(default_factory=dict)
     timeouts: Timeouts = Timeouts()
     interface: Interface | InterfaceReference | None = None
     flows: Flows = Flows()
