@@ -49,7 +49,6 @@ from lifecycle.manifest.yaml.document import Document, quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
 
-
 def build_on_violation(section: Document) -> OnViolation:
     """Build `on_violation` of a document or a node; a single value is for every rule."""
     reactions = section.get("on_violation")

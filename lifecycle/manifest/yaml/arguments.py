@@ -19,7 +19,6 @@ from lifecycle.manifest.yaml.document import (
     Place,
     Scalar,
     Value,
-    check_finite,
     quote,
     resolve,
 )
@@ -252,8 +251,7 @@ class Substituted:
             # An empty string stays one, instead of becoming null.
             whole = len(parts) == 1 and isinstance(parts[0], Substitution)
             if whole and not value.quoted and text:
-                data = resolve(text)
-                check_finite(data, place)
+                data = resolve(text, place)
         except NotRunError as problem:
             self._leave_open(place, problem)
             return value

@@ -25,7 +25,6 @@ from lifecycle.manifest.yaml.document import (
     Place,
     Scalar,
     Value,
-    check_finite,
     quote,
     resolve,
     spell_place,
@@ -299,8 +298,7 @@ class _Composer:
         data: Scalar = event.value
         if not quoted:
             try:
-                data = resolve(event.value)
-                check_finite(data, place)
+                data = resolve(event.value, place)
             except ValueError as problem:
                 message = f"cannot use {quote(event.value)}: {problem}"
                 self._note("yaml.number", mark, place, message)
