@@ -45,7 +45,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.shared import Shared, build_parameters, flat_parameters, parameter_value
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, quote
+from lifecycle.manifest.yaml.document import Document
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 
 
@@ -128,17 +128,9 @@ def build_interface(
         return Interface()
     if isinstance(part.root.data, dict):
         return build_inline(part, found)
-    reference = part.root.text
-    try:
-        interface, findings = read_interface(
-            reference, base=base, at=part.at(), environment=environment
-        )
-    except OSError as problem:  # a name that is too long, a folder that is not ours to search
-        message = f"cannot follow {quote(reference)}: {problem.strerror}"
-        found.append(error("nodl.not-found", part.at(), message))
-        return Interface(source=reference)
-    found.extend(findings)
-    return interface
+    return read_interface(
+        part.root.text, base=base, at=part.at(), environment=environment, found=found
+    )
 
 
 def build_node(

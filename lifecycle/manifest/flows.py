@@ -240,52 +240,38 @@ class FlowNeeds:
 
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
         topic = topic_of(node, need.name, need.kind)
-        delay = self._max_delay_ms(node, need, topic)
-        flow_class = class_of(need, max_delay_ms=delay)
-        resolved = ResolvedNeed(
-            need=need,
-            topic=topic,
-            unique=need.unique.asks,
-            flow_class=flow_class,
-            priority=self._priority(need),
-            max_delay_ms=delay,
-            transports=self._transports(node) if self._by_participant(need) else (),
-        )
-        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(node, resolved))
-
-    def _priority(self, need: FlowNeed) -> MappedPriority | None:
-        if need.transport_priority is None:
-            return None
-        mapping = self._manifest.network.transport_priority_mapping
-        return map_priority(need.transport_priority, mapping or DIRECT)
-
-    def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
-        if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
-            return need.max_delay_ms
-        return self._delays.get((node.key, topic))
-
-    def _by_participant(self, need: FlowNeed) -> bool:
-        """Whether the need is met by what its participant may use, with no connection at all.
-
-        Where discovery sets what participants have, negotiation decides (`lifecycle.plan`).
-        """
-        discovery = self._manifest.discovery
-        return (
+        network, discovery = self._manifest.network, self._manifest.discovery
+        priority = None
+        if need.transport_priority is not None:
+            mapping = network.transport_priority_mapping or DIRECT
+            priority = map_priority(need.transport_priority, mapping)
+        delay = need.max_delay_ms
+        if delay is None and need.kind is EndpointKind.PUBLISHER:
+            delay = self._delays.get((node.key, topic))
+        # Where discovery sets what participants have, negotiation decides (`lifecycle.plan`).
+        by_participant = (
             need.transport is FlowTransport.NETWORK
             and discovery.mode is DiscoveryMode.DYNAMIC
             and discovery.transport is FlowTransport.ANY
         )
+        address = self._manifest.address_of(node.machine)
+        resolved = ResolvedNeed(
+            need=need,
+            topic=topic,
+            unique=need.unique.asks,
+            flow_class=class_of(need, max_delay_ms=delay),
+            priority=priority,
+            max_delay_ms=delay,
+            transports=(udp_to(address),) if by_participant else (),
+        )
+        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(address, resolved))
 
-    def _transports(self, node: Node) -> tuple[Medium, ...]:
-        return (udp_to(self._manifest.address_of(node.machine)),)
-
-    def _max_datagram_bytes(self, node: Node, each: ResolvedNeed) -> int | None:
+    def _max_datagram_bytes(self, address: str, each: ResolvedNeed) -> int | None:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
             return None
         declared = self._manifest.network.max_datagram_bytes
-        ipv6 = ":" in self._manifest.address_of(node.machine)
-        limit = declared or max_unfragmented(ipv6=ipv6)
+        limit = declared or max_unfragmented(ipv6=":" in address)
         size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)
