@@ -191,10 +191,9 @@ class FlowNeeds:
             yield self._resolved[node.key, need.kind, need.name]
 
     def node_transports(self, node: Node) -> tuple[Medium, ...]:
-        """Return all that a node's own participant may use; empty for any.
+        """Return all that a node's own participant may use, and its subscriptions receive by.
 
-        Its subscriptions receive there; so if one must not get its data by shared memory, none of
-        the node's can.
+        Empty for any.
         """
         for each in self.of_node(node):
             if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:

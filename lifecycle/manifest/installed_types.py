@@ -116,12 +116,7 @@ _PARTS = {
 
 
 def join(hashes: Sequence[str]) -> str:
-    """Put the hashes of one interface's messages together; empty if one of them is not known.
-
-    Args:
-        hashes: of a message; of a service's request and response; of an action's goal request and
-            response, result request and response, and feedback message.
-    """
+    """Put the hashes of one interface's messages together; empty if one of them is not known."""
     return " ".join(hashes) if all(hashes) else ""
 
 

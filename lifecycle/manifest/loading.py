@@ -329,14 +329,7 @@ class _Loading:
     def _contents(
         self, reading: _Reading, root: Document, around: Shared, entry: Document | None
     ) -> None:
-        """Add what a document or group has.
-
-        Args:
-            reading: the file.
-            root: the document or group.
-            around: what is around it gives its nodes.
-            entry: the group or the include that it came by.
-        """
+        """Add what a document or group has; `entry` is the group or the include that it came by."""
         shared = around.inner(root, self.found)
         for key, part in root.entries("nodes"):
             node = build_node(
@@ -423,8 +416,7 @@ class _Loading:
     def _moved(self, topic: str, ends: Iterable[tuple[str, EndpointKind]], namespace: str) -> str:
         """Return what a topic is called in the system that its document is included in.
 
-        Names of nodes move with their namespace, and so do relative topic names; an absolute topic
-        name stays where it is. A link's topic moves with its publisher.
+        It moves with its publisher; only names that are not absolute move with a namespace.
         """
         for key, kind in ends:
             node = self._nodes.get(key)

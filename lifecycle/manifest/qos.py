@@ -88,8 +88,7 @@ POLICIES = QosProfile.__struct_fields__
 def not_written(written: Collection[str]) -> tuple[str, ...]:
     """Return the policies that a manifest leaves to the default of the endpoint's kind.
 
-    Args:
-        written: keys of a profile; a depth means nothing without KEEP_LAST, and writes it too.
+    A depth means nothing without KEEP_LAST, and writes it too.
     """
     found = {*written, "history"} if "depth" in written else set(written)
     return tuple(policy for policy in POLICIES if policy not in found)
@@ -174,13 +173,12 @@ def incompatibilities(offered: QosProfile, requested: QosProfile) -> tuple[Incom
     A policy whose value is SYSTEM_DEFAULT, UNKNOWN or BEST_AVAILABLE represents every value it
     may turn out to be: if some of them do not match, the result is POSSIBLE, if all, CERTAIN. That
     yields rmw_dds_common's `qos_profile_check_compatible` (its errors are CERTAIN, its warnings
-    POSSIBLE), with two differences on purpose: BEST_AVAILABLE, which rmw passes over, is resolved
-    when the endpoint is made and depends on what discovery has shown by then, so a subscription
-    with it may still fail to match; and an infinite duration equals an unset one.
+    POSSIBLE), but for BEST_AVAILABLE, which depends on what discovery has shown, so that a
+    subscription with it may still fail to match; and an infinite duration equals an unset one.
 
     Returns:
-        Findings in the order reliability, durability, deadline, liveliness, lease; empty if the two
-        match for certain. History, depth and lifespan never stop a match (DDS 1.4 §2.2.3).
+        Findings in the order reliability, durability, deadline, liveliness, lease. History, depth
+        and lifespan never stop a match (DDS 1.4 §2.2.3).
     """
     found = (
         _ordered(

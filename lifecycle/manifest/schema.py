@@ -56,15 +56,12 @@ def validate(
     definition: str = "",
     ignore: Collection[Place] = (),
 ) -> tuple[Diagnostic, ...]:
-    """Check a document.
+    """Return every violation of the schema, at most `MAX_FINDINGS`, in no particular order.
 
     Args:
         document: what to check.
         definition: name of a type in `written`, for a part of a manifest; the whole if empty.
         ignore: values already reported; nothing is reported about them or anything inside.
-
-    Returns:
-        Every violation, at most `MAX_FINDINGS`, in no particular order.
     """
     type_ = getattr(written, definition or "Manifest")
     if not ignore and _fits(document, type_):
