@@ -1,8 +1,7 @@
 """Validated `nodes:`, `data_layer:`, `modes:` and `connections:` → frozen types.
 
-Owns: how a node's keys become fields, its parameters flat and its paths absolute; reading
-connection URLs out of a document; and the findings about all of them that a schema cannot detect.
-Pure but for reading interfaces by reference.
+Owns: how a node's keys become fields and its paths absolute; and the findings about all of them
+that a schema cannot detect. Pure but for reading interfaces by reference.
 """
 
 from __future__ import annotations
@@ -46,10 +45,8 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.shared import Shared, build_parameters, flat_parameters, parameter_value
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document, quote
+from lifecycle.manifest.yaml.document import Document
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
-
-_KINDS = {kind.value: kind for kind in EndpointKind}
 
 
 def build_on_violation(section: Document) -> OnViolation:
@@ -74,12 +71,7 @@ _NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
 
 
 def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
-    """Return where parts of a document are, by path below a section: `run.python`, `remap.scan`.
-
-    Args:
-        section: the document, or a node.
-        keys: those keys of it whose values are looked at, with all that is inside.
-    """
+    """Return where the values of `keys`, and all inside them, are by path: `remap.scan`."""
     found = {}
     if "on_violation" in section:
         found[f"on_violation.{BY_DEFAULT}"] = section.key_at(("on_violation",))
@@ -97,13 +89,7 @@ def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
 def build_connections(
     node: Document, interface: Interface, found: list[Diagnostic]
 ) -> tuple[ConnectionDeclaration, ...]:
-    """Build the connections that a node's section spells out.
-
-    Args:
-        node: the node.
-        interface: of that node; what `map: all` expands to.
-        found: findings are appended here.
-    """
+    """Build the connections of a node; `map: all` expands to its interface."""
     return tuple(
         ConnectionDeclaration(
             name=name,
@@ -127,7 +113,7 @@ def _map(connection: Document, interface: Interface) -> tuple[tuple[EndpointKind
     if connection.text("map") == "all":
         return tuple((each.kind, each.name) for each in interface.endpoints)
     return tuple(
-        (_KINDS[kind], each.root.text)
+        (EndpointKind(kind), each.root.text)
         for kind, names in connection.entries("map")
         for each in names.items()
     )
@@ -136,30 +122,15 @@ def _map(connection: Document, interface: Interface) -> tuple[tuple[EndpointKind
 def build_interface(
     node: Document, *, base: Path, environment: Mapping[str, str], found: Findings
 ) -> Interface:
-    """Build the interface of a node, inline or by reference; empty if it has none.
-
-    Args:
-        node: the node.
-        base: folder that `local://` starts from.
-        environment: for AMENT_PREFIX_PATH, where `nodl://` is searched.
-        found: findings are appended here.
-    """
+    """Build the interface of a node, inline or by reference; empty if it has none."""
     part = node.get("interface")
     if part is None:
         return Interface()
     if isinstance(part.root.data, dict):
         return build_inline(part, found)
-    reference = part.root.text
-    try:
-        interface, findings = read_interface(
-            reference, base=base, at=part.at(), environment=environment
-        )
-    except OSError as problem:  # a name that is too long, a folder that is not ours to search
-        message = f"cannot follow {quote(reference)}: {problem.strerror}"
-        found.append(error("nodl.not-found", part.at(), message))
-        return Interface(source=reference)
-    found.extend(findings)
-    return interface
+    return read_interface(
+        part.root.text, base=base, at=part.at(), environment=environment, found=found
+    )
 
 
 def build_node(
@@ -179,7 +150,7 @@ def build_node(
         base: folder that relative paths start from.
         shared: what it gets from the document and groups around it.
         environment: for AMENT_PREFIX_PATH.
-        found: findings are appended here.
+        found: where findings go.
     """
     node = read_part(part, written.Node)
     parameters = build_parameters(part, found)
@@ -353,14 +324,7 @@ _QUANTITIES = ("max_delay_ms", "loss", "max_silence_s", "max_message_size", "fiv
 
 
 def quantities(part: Document, keys: MeasuredKeys) -> Iterator[Quantity]:
-    """Yield the numbers of a flow or a link that only a measurement could prove.
-
-    `five_qi: auto` is none: it follows from the others.
-
-    Args:
-        part: where they are written.
-        keys: what is written there.
-    """
+    """Yield the numbers of a flow or a link that only a measurement could prove."""
     for name in _QUANTITIES:
         value = getattr(keys, name, None)
         if isinstance(value, (int, float)):

@@ -1,7 +1,6 @@
-"""Diagnostics of a manifest: file, line and column, rule, severity, message and hint.
+"""Diagnostics of a manifest: file, line and column, rule, severity, message and hint. Pure.
 
-Owns: `Position`, `Diagnostic`, `ManifestError`. Every check appends diagnostics and continues, so
-that a user sees all findings at once. Pure.
+Every check appends diagnostics and continues, so that a user sees all findings at once.
 """
 
 from __future__ import annotations
@@ -96,12 +95,7 @@ def note(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
 
 
 def in_order(found: Iterable[Diagnostic], files: Iterable[str]) -> tuple[Diagnostic, ...]:
-    """Return findings once each, by file, then by position.
-
-    Args:
-        found: findings, also of other files than `files`: those come last.
-        files: as they were read.
-    """
+    """Return findings once each, by file as they were read, others last, then by position."""
     unique = list(dict.fromkeys(found))
     read = dict.fromkeys([*files, *(each.at.file for each in unique)])
     rank = {file: index for index, file in enumerate(read)}

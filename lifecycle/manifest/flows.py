@@ -52,12 +52,7 @@ class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def class_of(need: FlowNeed, *, max_delay_ms: float | None) -> FlowClass:
-    """Return the class of one publisher's flow.
-
-    Args:
-        need: what it asks for; a declared `rate_hz` asks for a guaranteed rate.
-        max_delay_ms: declared, else that of its links; None without.
-    """
+    """Return the class of one publisher's flow; the delay is declared, or that of its links."""
     message_bytes = need.max_message_size
     rate_bps = (
         need.rate_hz * message_bytes * 8
@@ -196,10 +191,9 @@ class FlowNeeds:
             yield self._resolved[node.key, need.kind, need.name]
 
     def node_transports(self, node: Node) -> tuple[Medium, ...]:
-        """Return all that a node's own participant may use; empty for any.
+        """Return all that a node's own participant may use, and its subscriptions receive by.
 
-        Its subscriptions receive there; so if one must not get its data by shared memory, none of
-        the node's can.
+        Empty for any.
         """
         for each in self.of_node(node):
             if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:
@@ -212,11 +206,10 @@ class FlowNeeds:
         """Return the extra participants that a node's endpoints need: as few as meet every need.
 
         A publisher that needs an NFE of its own shares with none. Others share if they ask for the
-        same DSCP, 5QI, transports and way of sending; the smaller datagram size serves both.
-        Subscriptions need one if they are marked, because acknowledgements leave by the sockets of
-        the participant; they share it with those of the same DSCP and transports, not with
-        publishers: a network that looks at marks must not take the one for the other's flow. Within
-        one node only: a participant belongs to a node, whose hidden node is what the graph shows.
+        same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
+        acknowledgements leave by the sockets of the participant; they never share with publishers,
+        whose flow a network that looks at marks must not take theirs for. Within one node only: a
+        participant belongs to a node, whose hidden node is what the graph shows.
         """
         found: dict[object, ParticipantGroup] = {}
         own = (None, None, self.node_transports(node), False)
@@ -246,52 +239,38 @@ class FlowNeeds:
 
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
         topic = topic_of(node, need.name, need.kind)
-        delay = self._max_delay_ms(node, need, topic)
-        flow_class = class_of(need, max_delay_ms=delay)
-        resolved = ResolvedNeed(
-            need=need,
-            topic=topic,
-            unique=need.unique.asks,
-            flow_class=flow_class,
-            priority=self._priority(need),
-            max_delay_ms=delay,
-            transports=self._transports(node) if self._by_participant(need) else (),
-        )
-        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(node, resolved))
-
-    def _priority(self, need: FlowNeed) -> MappedPriority | None:
-        if need.transport_priority is None:
-            return None
-        mapping = self._manifest.network.transport_priority_mapping
-        return map_priority(need.transport_priority, mapping or DIRECT)
-
-    def _max_delay_ms(self, node: Node, need: FlowNeed, topic: str) -> float | None:
-        if need.max_delay_ms is not None or need.kind is not EndpointKind.PUBLISHER:
-            return need.max_delay_ms
-        return self._delays.get((node.key, topic))
-
-    def _by_participant(self, need: FlowNeed) -> bool:
-        """Whether the need is met by what its participant may use, with no connection at all.
-
-        Where discovery sets what participants have, negotiation decides (`lifecycle.plan`).
-        """
-        discovery = self._manifest.discovery
-        return (
+        network, discovery = self._manifest.network, self._manifest.discovery
+        priority = None
+        if need.transport_priority is not None:
+            mapping = network.transport_priority_mapping or DIRECT
+            priority = map_priority(need.transport_priority, mapping)
+        delay = need.max_delay_ms
+        if delay is None and need.kind is EndpointKind.PUBLISHER:
+            delay = self._delays.get((node.key, topic))
+        # Where discovery sets what participants have, negotiation decides (`lifecycle.plan`).
+        by_participant = (
             need.transport is FlowTransport.NETWORK
             and discovery.mode is DiscoveryMode.DYNAMIC
             and discovery.transport is FlowTransport.ANY
         )
+        address = self._manifest.address_of(node.machine)
+        resolved = ResolvedNeed(
+            need=need,
+            topic=topic,
+            unique=need.unique.asks,
+            flow_class=class_of(need, max_delay_ms=delay),
+            priority=priority,
+            max_delay_ms=delay,
+            transports=(udp_to(address),) if by_participant else (),
+        )
+        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(address, resolved))
 
-    def _transports(self, node: Node) -> tuple[Medium, ...]:
-        return (udp_to(self._manifest.address_of(node.machine)),)
-
-    def _max_datagram_bytes(self, node: Node, each: ResolvedNeed) -> int | None:
+    def _max_datagram_bytes(self, address: str, each: ResolvedNeed) -> int | None:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
             return None
         declared = self._manifest.network.max_datagram_bytes
-        ipv6 = ":" in self._manifest.address_of(node.machine)
-        limit = declared or max_unfragmented(ipv6=ipv6)
+        limit = declared or max_unfragmented(ipv6=":" in address)
         size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
         small = declared is None if size is None else not is_fragmented(size, limit)

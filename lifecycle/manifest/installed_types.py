@@ -2,12 +2,8 @@
 
 Owns: where the ament resource index is and how a resource is found in it, as ament_index_python
 does, but for a prefix that AMENT_PREFIX_PATH need not name: wheels install the index under
-`sys.prefix`. The three answers to "is there a `sensor_msgs/msg/Image`?". The type hash of an
-interface, from the `share/<package>/<kind>/<Type>.json` that rosidl installs beside every
-definition, and how the hashes of a service's and an action's messages are put together.
-
-Imports no message package, so that a manifest is checked without ROS installed or sourced. Reads
-the file system.
+`sys.prefix`. The type hash of an interface, from the `share/<package>/<kind>/<Type>.json` that
+rosidl installs beside every definition. Imports no message package.
 """
 
 from __future__ import annotations
@@ -78,12 +74,7 @@ class TypeLookup(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
-    """Look a type up.
-
-    Args:
-        type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
-        prefixes: where to search, from `search_prefixes`.
-    """
+    """Look a type up, `package/msg/Type`, in the prefixes of `search_prefixes`."""
     package, _, name = type_.partition("/")
     found = find_resource(_RESOURCE, package, prefixes)
     if found is None:
@@ -125,12 +116,7 @@ _PARTS = {
 
 
 def join(hashes: Sequence[str]) -> str:
-    """Put the hashes of one interface's messages together; empty if one of them is not known.
-
-    Args:
-        hashes: of a message; of a service's request and response; of an action's goal request and
-            response, result request and response, and feedback message.
-    """
+    """Put the hashes of one interface's messages together; empty if one of them is not known."""
     return " ".join(hashes) if all(hashes) else ""
 
 
@@ -138,10 +124,6 @@ def installed_hash(type_: str, prefixes: Sequence[Path]) -> str:
     """Return the hash of a type as it is installed here, `RIHS01_df66…`, for `join` where several.
 
     Empty if the type is not installed here, or by a distribution that has no hashes (before Iron).
-
-    Args:
-        type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
-        prefixes: where to search, from `search_prefixes`.
     """
     parts = _PARTS.get(type_.partition("/")[2].partition("/")[0], ())
     try:

@@ -22,7 +22,6 @@ from lifecycle.codec import Octet
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import (
-    Diagnostic,
     Findings,
     ManifestError,
     Position,
@@ -63,12 +62,7 @@ _DEFAULT_PRESET = {
 
 
 def build_inline(interface: Document, found: Findings) -> Interface:
-    """Build an interface that is written out.
-
-    Args:
-        interface: a mapping that fits the schema's `interface`.
-        found: findings are appended here.
-    """
+    """Build an interface that is written out: a mapping that fits the schema's `Interface`."""
     endpoints = []
     for kind in EndpointKind:
         first: dict[str, Document] = {}
@@ -190,41 +184,42 @@ def read_interface(
     *,
     base: str | Path,
     at: Position,
-    environment: Mapping[str, str] | None = None,
-) -> tuple[Interface, tuple[Diagnostic, ...]]:
-    """Read the interface that a reference names, with everything it includes.
+    environment: Mapping[str, str],
+    found: Findings,
+) -> Interface:
+    """Read the interface that a reference names, with everything it includes, as far as it can be.
 
     Args:
         reference: `local://PATH`, relative to `base`, or `nodl://PACKAGE/NAME` in the ament index.
         base: directory of the document that holds the reference.
         at: where that document holds it.
-        environment: for AMENT_PREFIX_PATH; this process's if None.
-
-    Returns:
-        The interface, with `source` set, and every finding. After an error the interface holds
-        what could be read.
+        environment: for AMENT_PREFIX_PATH.
+        found: where findings go.
     """
-    reading = _NodlReading(search_prefixes(environment))
-    reading.follow(reference, Path(base), at, ())
+    reading = _NodlReading(search_prefixes(environment), found)
+    try:
+        reading.follow(reference, Path(base), at, ())
+    except OSError as problem:  # a name that is too long, a folder that is not ours to search
+        message = f"cannot follow {quote(reference)}: {problem.strerror}"
+        found.append(error("nodl.not-found", at, message))
     reading.report_collisions()
-    interface = Interface(
+    return Interface(
         endpoints=tuple(reading.endpoints),
         parameters=tuple(reading.parameters),
         source=reference,
         has_all_parameters=True,
     )
-    return interface, tuple(reading.found)
 
 
 class _NodlReading:
     """One walk over a document and its includes; collects entities and findings."""
 
-    def __init__(self, prefixes: tuple[Path, ...]) -> None:
+    def __init__(self, prefixes: tuple[Path, ...], found: Findings) -> None:
         self._prefixes = prefixes
         self._read: set[Path] = set()
         self.endpoints: list[Endpoint] = []
         self.parameters: list[ParameterDeclaration] = []
-        self.found: list[Diagnostic] = []
+        self.found = found
 
     def follow(self, reference: str, base: Path, at: Position, chain: tuple[Path, ...]) -> None:
         """Read one reference; `chain` holds the documents that led to it."""
@@ -406,10 +401,7 @@ class _NodlReading:
 
 
 def nearest_file(path: Path) -> str:
-    """Return a hint that names the file, beside one that is missing, with the nearest name.
-
-    Only files of the same kind count, and only up to the first dot, where kinds begin.
-    """
+    """Return a hint that names the file of the same kind with the nearest name in that folder."""
     stem, _, kind = path.name.partition(".")
     files = [each.name.partition(".") for each in path.parent.glob(f"*.{kind}")]
     stems = {each: f"{each}{dot}{rest}" for each, dot, rest in files if rest == kind}

@@ -52,7 +52,7 @@ from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import THIS_HOST, Shared, settle
 from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.arguments import Substituted, substitute
+from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
@@ -143,7 +143,7 @@ class ArgumentDeclaration(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
-    """Return the arguments that one manifest declares, in their order, whatever else is in it.
+    """Return the arguments that one manifest declares, whatever else is in it.
 
     Raises:
         ManifestError: it cannot be read, or its `arguments:` are none.
@@ -274,7 +274,11 @@ class _Loading:
             return
         self._check_suffix(document)
         before = len(self.found)
-        substituted = self._substituted(document, path, given, entry)
+        surroundings = Surroundings(
+            environment=self._environment, folder=folder_of(path), programs=self._programs
+        )
+        substituted = substitute(document, given, surroundings, include=entry)
+        self.found += substituted.found
         document = substituted.document
         emptied = [
             place[:-1]
@@ -285,11 +289,11 @@ class _Loading:
         self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return
-        self._system(document, substituted.arguments)
+        self._system(document, tuple(substituted.arguments.items()))
         for name, each in document.entries("machines"):
             self._machine(name, each)
         first_link = len(self._links)
-        reading = _Reading(chain=(*chain, path), left_out=substituted.left_out)
+        reading = _Reading(chain=(*chain, path), left_out=tuple(substituted.left_out))
         self._contents(reading, document, around, entry)
         links = [self._link(each, around) for each in document.items("links")]
         self._links[first_link:first_link] = links
@@ -322,33 +326,10 @@ class _Loading:
                 at = document.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))
 
-    def _substituted(
-        self,
-        document: Document,
-        path: Path,
-        given: Mapping[str, str],
-        entry: Document | None,
-    ) -> Substituted:
-        surroundings = Surroundings(
-            environment=self._environment,
-            folder=folder_of(path),
-            programs=self._programs,
-        )
-        found = substitute(document, given, surroundings, include=entry)
-        self.found += found.diagnostics
-        return found
-
     def _contents(
         self, reading: _Reading, root: Document, around: Shared, entry: Document | None
     ) -> None:
-        """Add what a document or group has.
-
-        Args:
-            reading: the file.
-            root: the document or group.
-            around: what is around it gives its nodes.
-            entry: the group or the include that it came by.
-        """
+        """Add what a document or group has; `entry` is the group or the include that it came by."""
         shared = around.inner(root, self.found)
         for key, part in root.entries("nodes"):
             node = build_node(
@@ -435,8 +416,7 @@ class _Loading:
     def _moved(self, topic: str, ends: Iterable[tuple[str, EndpointKind]], namespace: str) -> str:
         """Return what a topic is called in the system that its document is included in.
 
-        Names of nodes move with their namespace, and so do relative topic names; an absolute topic
-        name stays where it is. A link's topic moves with its publisher.
+        It moves with its publisher; only names that are not absolute move with a namespace.
         """
         for key, kind in ends:
             node = self._nodes.get(key)
@@ -486,7 +466,7 @@ MAX_MANIFESTS = 256
 
 
 def _shown(path: Path) -> str:
-    """Return how messages name a file: bytes that are no UTF-8 could be neither _shown nor sent."""
+    """Return how messages name a file: bytes that are no UTF-8 could be neither shown nor sent."""
     return os.fsencode(path).decode("utf-8", errors="replace")
 
 
@@ -499,13 +479,7 @@ def _identity(path: Path) -> str:
 
 
 def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
-    """Return the file that an entry of `include:` names; None after reporting why there is none.
-
-    Args:
-        entry: the entry.
-        chain: the including manifests, outermost first.
-        found: findings are appended here.
-    """
+    """Return the file that an entry of `include:` names; None after reporting why there is none."""
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
     identities = [_identity(each) for each in chain]

@@ -69,11 +69,7 @@ class RemapRule(msgspec.Struct, frozen=True, kw_only=True):
 
 @functools.lru_cache(maxsize=1 << 12)
 def parse_rule(match: str, replacement: str) -> RemapRule:
-    """Read the two sides of `match:=replacement`.
-
-    Raises:
-        NameNotLegalError: rcl would refuse it.
-    """
+    """Read the two sides of `match:=replacement`; NameNotLegalError if rcl would refuse it."""
     node, rest = "", match
     if prefix := _NODE_PREFIX.fullmatch(match):
         node, rest = prefix[1], prefix[2]
@@ -186,11 +182,6 @@ def free_name(name: str, taken: Container[str]) -> str:
 def expand(name: str, node_name: str, namespace: str) -> str:
     """Return the fully qualified form of `name`, before remapping, as rcl_expand_topic_name.
 
-    Args:
-        name: relative, absolute, `~`, `~/private`, with or without substitutions.
-        node_name: base name of the node.
-        namespace: absolute, `/` for the root.
-
     Raises:
         NameNotLegalError: the name, the node's name or its namespace is not legal, or the result
             is not (two slashes in a row, too long).
@@ -227,9 +218,9 @@ def resolve(
     """Return the fully qualified name that an endpoint has in the graph.
 
     The name is expanded, then the first rule whose expanded `from` equals it replaces it
-    (rcl_remap_name); a replacement is not remapped again. Actions are expanded only: rcl of ROS 2
-    Jazzy remaps an action's hidden topics and services one by one, never the action, so an action
-    is renamed exactly when rules give all its hidden names one new action name.
+    (rcl_remap_name); a replacement is not remapped again. rcl of ROS 2 Jazzy remaps an action's
+    hidden topics and services one by one, never the action, so an action is renamed exactly when
+    rules give all its hidden names one new action name.
 
     Args:
         name: as declared.
@@ -259,11 +250,7 @@ def resolve(
 
 
 def name_in_graph(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
-    """Return the fully qualified name that an endpoint of a node has in the graph.
-
-    Raises:
-        NameNotLegalError: see `resolve`.
-    """
+    """Return what `resolve` says of an endpoint of a node, or raise its NameNotLegalError."""
     return resolve(name, node_name=node.name, namespace=node.namespace, remap=node.remap, kind=kind)
 
 
@@ -281,11 +268,7 @@ def hidden_names(action: str) -> tuple[tuple[str, EndpointKind], ...]:
 
 
 def action_of(name: str, resolved: Mapping[str, str]) -> str:
-    """Return what an action is called whose hidden names were resolved one by one.
-
-    Args:
-        name: of the action, for messages.
-        resolved: hidden name → fully qualified name after remapping, of all five.
+    """Return what an action is called whose five hidden names were resolved one by one.
 
     Raises:
         NameNotLegalError: they belong to different actions.
@@ -378,9 +361,7 @@ _ORDERING = ("pause", "resume", "restart", "down")
 def supervisor_prefix(system: str, machine: str = "") -> str:
     """Return what the names of a supervisor's status topic and services begin with.
 
-    Args:
-        system: its name.
-        machine: of the supervisor, where nodes of the system run on several; else empty.
+    `machine` is its own where nodes of the system run on several; else empty.
     """
     names = (system, machine) if machine else (system,)
     return SUPERVISORS + "/".join(each.replace("-", "_") for each in names)
@@ -405,12 +386,7 @@ def node_alive_topic(full_name: str) -> str:
 
 
 def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names, below its prefix, of the services that a supervisor offers.
-
-    Args:
-        access: what the manifest allows.
-        modes: names of those that it may be asked to enter.
-    """
+    """Return the names, below its prefix, of a supervisor's services; of those for modes, too."""
     if access is RosInterfaceAccess.OFF:
         return ()
     if access is RosInterfaceAccess.READ_ONLY:

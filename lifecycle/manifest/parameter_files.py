@@ -58,12 +58,7 @@ _LONGEST_INTEGER = 80
 
 
 def read_scalar(text: str, *, quoted: bool) -> bool | int | float | str:
-    """Return what rcl makes of a scalar in a parameter file.
-
-    Args:
-        text: as written, without quotes.
-        quoted: it was written in quotes.
-    """
+    """Return what rcl makes of a scalar in a parameter file; `quoted`: it was in quotes there."""
     if quoted:
         return text
     if text in _TRUE or text in _FALSE:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 import types
 from collections.abc import Collection, Mapping
-from typing import TypeVar
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -88,14 +88,11 @@ POLICIES = QosProfile.__struct_fields__
 def not_written(written: Collection[str]) -> tuple[str, ...]:
     """Return the policies that a manifest leaves to the default of the endpoint's kind.
 
-    Args:
-        written: keys of a profile; a depth means nothing without KEEP_LAST, and writes it too.
+    A depth means nothing without KEEP_LAST, and writes it too.
     """
     found = {*written, "history"} if "depth" in written else set(written)
     return tuple(policy for policy in POLICIES if policy not in found)
 
-
-_Policy = TypeVar("_Policy", Reliability, Durability, Liveliness)
 
 INFINITE_NS = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds; also the largest duration rmw can hold."""
@@ -174,69 +171,58 @@ def incompatibilities(offered: QosProfile, requested: QosProfile) -> tuple[Incom
     A policy whose value is SYSTEM_DEFAULT, UNKNOWN or BEST_AVAILABLE represents every value it
     may turn out to be: if some of them do not match, the result is POSSIBLE, if all, CERTAIN. That
     yields rmw_dds_common's `qos_profile_check_compatible` (its errors are CERTAIN, its warnings
-    POSSIBLE), with two differences on purpose: BEST_AVAILABLE, which rmw passes over, is resolved
-    when the endpoint is made and depends on what discovery has shown by then, so a subscription
-    with it may still fail to match; and an infinite duration equals an unset one.
+    POSSIBLE), but for BEST_AVAILABLE, which depends on what discovery has shown, so that a
+    subscription with it may still fail to match; and an infinite duration equals an unset one.
 
     Returns:
-        Findings in the order reliability, durability, deadline, liveliness, lease; empty if the two
-        match for certain. History, depth and lifespan never stop a match (DDS 1.4 §2.2.3).
+        Findings in the order reliability, durability, deadline, liveliness, lease. History, depth
+        and lifespan never stop a match (DDS 1.4 §2.2.3).
     """
-    found = (
-        _ordered(
-            "reliability",
-            offered.reliability,
-            requested.reliability,
-            offers=_RELIABILITY_OFFERS,
-            strong=Reliability.RELIABLE,
-            weak=Reliability.BEST_EFFORT,
-        ),
-        _ordered(
-            "durability",
-            offered.durability,
-            requested.durability,
-            offers=_DURABILITY_OFFERS,
-            strong=Durability.TRANSIENT_LOCAL,
-            weak=Durability.VOLATILE,
-        ),
-        _duration("deadline", offered.deadline_ns, requested.deadline_ns),
-        _ordered(
-            "liveliness",
-            offered.liveliness,
-            requested.liveliness,
-            offers={},
-            strong=Liveliness.MANUAL_BY_TOPIC,
-            weak=Liveliness.AUTOMATIC,
-        ),
-        _duration(
-            "liveliness_lease_duration",
-            offered.liveliness_lease_duration_ns,
-            requested.liveliness_lease_duration_ns,
-        ),
-    )
+    found = []
+    for policy, values in _JUDGED.items():
+        if values is None:
+            name = f"{policy}_ns"
+            found.append(_duration(policy, getattr(offered, name), getattr(requested, name)))
+        else:
+            offer, request = getattr(offered, policy), getattr(requested, policy)
+            found.append(_ordered(policy, offer, request, values))
     return tuple(each for each in found if each is not None)
 
 
-_RELIABILITY_OFFERS = {Reliability.BEST_AVAILABLE: Reliability.RELIABLE}
-_DURABILITY_OFFERS = {Durability.BEST_AVAILABLE: Durability.TRANSIENT_LOCAL}
-# rmw_dds_common gives a BEST_AVAILABLE publisher the stronger value whatever it has discovered;
-# only its liveliness and durations depend on the subscriptions seen when it is made.
+class _Values(NamedTuple):
+    """The two values of a policy, and what a BEST_AVAILABLE publisher offers of it."""
+
+    strong: enum.Enum
+    weak: enum.Enum
+    best: enum.Enum
+
+
+_JUDGED: Mapping[str, _Values | None] = {
+    "reliability": _Values(Reliability.RELIABLE, Reliability.BEST_EFFORT, Reliability.RELIABLE),
+    "durability": _Values(
+        Durability.TRANSIENT_LOCAL, Durability.VOLATILE, Durability.TRANSIENT_LOCAL
+    ),
+    "deadline": None,
+    "liveliness": _Values(
+        Liveliness.MANUAL_BY_TOPIC, Liveliness.AUTOMATIC, Liveliness.BEST_AVAILABLE
+    ),
+    "liveliness_lease_duration": None,
+}
+"""Policies that may stop a match; None for a duration.
+
+rmw_dds_common gives a BEST_AVAILABLE publisher the stronger value whatever it has discovered; only
+its liveliness and durations depend on the subscriptions seen when it is made.
+"""
 
 
 def _ordered(
-    policy: str,
-    offered: _Policy,
-    requested: _Policy,
-    *,
-    offers: Mapping[_Policy, _Policy],
-    strong: _Policy,
-    weak: _Policy,
+    policy: str, offered: enum.Enum, requested: enum.Enum, values: _Values
 ) -> Incompatibility | None:
     """Judge a two-valued policy: only a weak offer to a strong request fails."""
-    effective = offers.get(offered, offered)
-    if effective is strong or requested is weak:
+    effective = values.best if offered.value == "BEST_AVAILABLE" else offered
+    if effective is values.strong or requested is values.weak:
         return None
-    certain = effective is weak and requested is strong
+    certain = effective is values.weak and requested is values.strong
     return Incompatibility(
         policy=policy,
         offered=offered.value,

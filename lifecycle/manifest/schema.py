@@ -1,10 +1,8 @@
 """Validate a document against its JSON Schema, with diagnostics that people can act on.
 
 Owns: loading the shipped schemas; turning each error of jsonschema into diagnostics, for the branch
-that was meant where a choice failed; the wording: what is allowed, derived from a schema's
-keywords, and the nearest spelling. Every message starts with "cannot" and quotes the value. Also
-the quick look by which a document that fits needs no jsonschema. Pure but for reading the shipped
-schemas.
+that was meant where a choice failed; their wording, from a schema's keywords, and the nearest
+spelling. A document that fits is found so by msgspec alone.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import itertools
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -30,9 +28,8 @@ from lifecycle.manifest.yaml.document import (
 )
 from lifecycle.manifest.yaml.source import MAX_FINDINGS
 
-if TYPE_CHECKING:  # it costs 60 ms, and who only asks for a similar name needs none of it
-    from jsonschema import Draft202012Validator
-    from jsonschema.exceptions import ValidationError
+ValidationError = Any
+"""jsonschema's, which has no types for what it holds; it takes 60 ms to import."""
 
 _CHOICES = ("anyOf", "oneOf")
 
@@ -59,15 +56,12 @@ def validate(
     definition: str = "",
     ignore: Collection[Place] = (),
 ) -> tuple[Diagnostic, ...]:
-    """Check a document.
+    """Return every violation of the schema, at most `MAX_FINDINGS`, in no particular order.
 
     Args:
         document: what to check.
         definition: name of a type in `written`, for a part of a manifest; the whole if empty.
         ignore: values already reported; nothing is reported about them or anything inside.
-
-    Returns:
-        Every violation, at most `MAX_FINDINGS`, in no particular order.
     """
     type_ = getattr(written, definition or "Manifest")
     if not ignore and _fits(document, type_):
@@ -104,8 +98,8 @@ def _fits(document: Document, type_: type) -> bool:
 
 
 @functools.cache
-def validator(definition: str = "") -> Draft202012Validator:
-    """Return what asks jsonschema about a part of a manifest; `definition` as in `validate`."""
+def validator(definition: str = "") -> Any:
+    """Return a Draft202012Validator of a part of a manifest; `definition` as in `validate`."""
     from jsonschema import Draft202012Validator
 
     schema = _resolved_only(read_schema(MANIFEST))
@@ -158,26 +152,9 @@ def _place(each: ValidationError) -> Place:
     return tuple(each.absolute_path)
 
 
-def _operand(each: ValidationError) -> Any:
-    """Return what the schema has for the broken keyword."""
-    return each.validator_value
-
-
-def _subschema(each: ValidationError) -> Mapping[str, Any]:
-    """Return what of the schema holds the broken keyword."""
-    assert isinstance(each.schema, Mapping)
-    return each.schema
-
-
-def _mapping(each: ValidationError) -> Mapping[str, Any]:
-    """Return the mapping whose keys are wrong."""
-    assert isinstance(each.instance, Mapping)
-    return each.instance
-
-
 def _is_way(each: ValidationError) -> bool:
     """Whether it is a choice between ways to fill a mapping, each a list of required keys."""
-    return each.validator in _CHOICES and all("required" in x for x in _operand(each))
+    return each.validator in _CHOICES and all("required" in x for x in each.validator_value)
 
 
 def _diagnose(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
@@ -189,13 +166,13 @@ def _diagnose(document: Document, each: ValidationError) -> Iterator[tuple[Place
         yield from _missing_keys(document, each)
     elif "propertyNames" in each.absolute_schema_path:
         place = (*place, str(each.instance))
-        meant = _closest(each.instance, _operand(each)) if each.validator == "enum" else ""
+        meant = _closest(each.instance, each.validator_value) if each.validator == "enum" else ""
         message, hint = f"cannot use {quote(each.instance)} as a key here", meant or _pattern(each)
         yield place, error("manifest.key", document.key_at(place), message, hint)
     elif not _is_way(each):
         rule = _RULES.get(str(each.validator), "value")
         yield place, error(f"manifest.{rule}", document.at(place), *_value(each))
-    elif not _misspelt(each) & {key for way in _operand(each) for key in way["required"]}:
+    elif not _misspelt(each) & {key for way in each.validator_value for key in way["required"]}:
         yield place, error("manifest.choice", document.at(place), *_way(each))
 
 
@@ -204,13 +181,13 @@ _RULES = {"type": "type", "oneOf": "choice", "anyOf": "choice", "pattern": "patt
 
 def _known(each: ValidationError) -> Mapping[str, Any]:
     """Return the keys that the mapping of an error may have, and their schemas."""
-    known: Mapping[str, Any] = _subschema(each).get("properties", {})
+    known: Mapping[str, Any] = each.schema.get("properties", {})
     return known
 
 
 def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
     known = _known(each)
-    for key in _mapping(each):
+    for key in each.instance:
         if key in known:
             continue
         message, hint = f"cannot use the unknown key {quote(key)}", did_you_mean(key, known)
@@ -222,8 +199,8 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
 
 def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
     place, known = _place(each), _known(each)
-    for key in _operand(each):
-        if key not in _mapping(each) and key not in _misspelt(each):
+    for key in each.validator_value:
+        if key not in each.instance and key not in _misspelt(each):
             schema = known.get(key, {})
             example = (schema.get("examples") or [schema.get("const", "…")])[0]
             message, hint = f"cannot do without the key {key!r}", f"add '{key}: {example}'"
@@ -234,7 +211,7 @@ def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
 def _misspelt(each: ValidationError) -> set[str]:
     """Return the known keys that unknown ones probably mean: the unknown key is finding enough."""
     known = _known(each)
-    return {nearest(key, known) for key in _mapping(each) if key not in known}
+    return {nearest(key, known) for key in each.instance if key not in known}
 
 
 def _value(each: ValidationError) -> tuple[str, str]:
@@ -262,23 +239,26 @@ def _allowed(each: ValidationError) -> tuple[str, str]:
     if each.validator in _CHOICES:
         own = (inner for inner in _meant(each.context or ()) if _place(inner) == _place(each))
         types = [
-            name for inner in own if inner.validator == "type" for name in _listed(_operand(inner))
+            name
+            for inner in own
+            if inner.validator == "type"
+            for name in _listed(inner.validator_value)
         ]
         return _types(each.instance, types)
     if each.validator == "type":
-        return _types(each.instance, _listed(_operand(each)))
+        return _types(each.instance, _listed(each.validator_value))
     if each.validator in {"enum", "const"}:
-        allowed = [_operand(each)] if each.validator == "const" else _operand(each)
+        allowed = [each.validator_value] if each.validator == "const" else each.validator_value
         return f"allowed: {_spell(allowed)}", _closest(each.instance, allowed)
     if each.validator == "pattern":
         return "", _pattern(each)
-    return f"allowed: {_range(_subschema(each))}", ""
+    return f"allowed: {_range(each.schema)}", ""
 
 
 def _way(each: ValidationError) -> tuple[str, str]:
     """Describe a failed choice between ways to fill a mapping."""
-    ways: list[list[str]] = [branch["required"] for branch in _operand(each)]
-    given = [key for key in _mapping(each) if any(key in way for way in ways)]
+    ways: list[list[str]] = [branch["required"] for branch in each.validator_value]
+    given = [key for key in each.instance if any(key in way for way in ways)]
     only = "exactly one" if each.validator == "oneOf" else "at least one"
     spelled = ", ".join(" with ".join(way) for way in ways)
     whole = [way for way in ways if all(key in given for key in way)]
@@ -331,8 +311,8 @@ def _closest(value: object, allowed: list[object]) -> str:
 
 
 def _pattern(each: ValidationError) -> str:
-    schema = _subschema(each)
-    return str(schema.get("patternErrorMessage") or f"it must match {schema.get('pattern')}")
+    pattern = each.schema.get("pattern")
+    return str(each.schema.get("patternErrorMessage") or f"it must match {pattern}")
 
 
 def _spell(values: Iterable[object]) -> str:

@@ -53,12 +53,7 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
     supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
 
     def inner(self, root: Document, found: Findings) -> Shared:
-        """Return what holds inside a document or group, or in what an include names.
-
-        Args:
-            root: its keys.
-            found: findings are appended here.
-        """
+        """Return what holds inside a document or group, or in what an include names."""
         parameters = build_parameters(root, found)
         sim_time = root.get(SIM_TIME)
         if sim_time is not None and SIM_TIME in parameters:
@@ -90,18 +85,21 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
         return "/".join(each for each in (self.namespace, namespace.strip("/")) if each)
 
     def given_to(self, node: Node) -> Node:
-        """Return a node with what it does not set itself."""
-        node = self._supervised(node)
-        if not self.parameters and not self.remap:
-            return node
-        own = dict(node.parameters)
+        """Return a node with what it does not set itself; who starts it otherwise restarts it."""
+        own, rules = dict(node.parameters), dict(node.remap)
         parameters = {name: each for name, each in self.parameters.items() if name not in own}
-        rules = dict(node.remap)
         remap = {name: each for name, each in self.remap.items() if name not in rules}
+        supervision = {
+            key: each
+            for key, each in self.supervision.items()
+            if key not in node.positions and node.run.kind is not RunKind.ATTACH
+        }
         positions = {
             **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
             **{f"remap.{name}": at for name, (_, at) in remap.items()},
+            **{key: at for key, (_, at) in supervision.items()},
         }
+        given = {key: value for key, (value, _) in supervision.items()}
         return replace(
             node,
             parameters=(
@@ -110,33 +108,17 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
             ),
             # rcl takes the first rule that matches: the node's own.
             remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
+            supervision=replace(node.supervision, **given),
             shared=node.shared | positions.keys(),
             positions={**node.positions, **positions},
-        )
-
-    def _supervised(self, node: Node) -> Node:
-        """Return a node with what is done when it fails; of who starts it otherwise, nothing."""
-        given = {key: each for key, each in self.supervision.items() if key not in node.positions}
-        if not given or node.run.kind is RunKind.ATTACH:
-            return node
-        values = {key: value for key, (value, _) in given.items()}
-        return replace(
-            node,
-            supervision=msgspec.structs.replace(node.supervision, **values),
-            shared=node.shared | given.keys(),
-            positions={**node.positions, **{key: at for key, (_, at) in given.items()}},
         )
 
 
 def settle(manifest: Manifest, files: ParameterFiles, found: Findings) -> Manifest:
     """Take from nodes the shared parameters that their files set, and those they do not declare.
 
-    Nodes of one process get what any of them says of its supervision.
-
-    Args:
-        manifest: with all that it includes, so that each node has its full name.
-        files: that its nodes name.
-        found: findings are appended here: shared parameters that no node declares.
+    Nodes of one process get what any of them says of its supervision. Each node of the manifest
+    has its full name.
     """
     found.extend(_for_no_node(manifest.nodes))
     own: dict[str, dict[str, object]] = {}
@@ -176,7 +158,7 @@ def _own_supervision(node: Node) -> dict[str, object]:
 
 def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
     values = {**process, **_own_supervision(node)}
-    supervision = msgspec.structs.replace(node.supervision, **values)
+    supervision = replace(node.supervision, **values)
     return replace(node, supervision=supervision) if process else node
 
 

@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 from lifecycle.manifest.model import (
     RULES_AND_FAMILIES,
     WORD,
+    Condition,
     DataLayer,
     Discovery,
     Dscp,
@@ -120,8 +121,7 @@ def read_special(type_: type, value: object) -> object:
     """Return what msgspec has no types for: a type that holds itself, a choice of two mappings.
 
     Raises:
-        msgspec.ValidationError: the value does not fit.
-        ValueError: likewise.
+        ValueError: the value does not fit.
     """
     if type_ is ParameterTree:
         return ParameterTree(msgspec.convert(value, TREE, dec_hook=read_special))
@@ -140,10 +140,10 @@ def read_special(type_: type, value: object) -> object:
 
 
 def read(plain: object, type_: type[T], *, strict: bool = True) -> T:
-    """Return a part of a document as its type.
+    """Return a part of a document, with substitutions resolved, as its type.
 
     Args:
-        plain: lists, mappings and scalars, substitutions resolved.
+        plain: lists, mappings and scalars.
         type_: what the part must be.
         strict: whether 5.0 is refused where an integer must be.
 
@@ -161,10 +161,7 @@ def read_part(document: Document, type_: type[T], place: Place = ()) -> T:
 def build(type_: type[B], section: Struct, /, **computed: Any) -> B:
     """Return what the model has of a section: the fields of the same name, and those computed.
 
-    Args:
-        type_: a type of `model`; what is not written (None) keeps its default there.
-        section: as it is written.
-        computed: fields that are more than the value of their key.
+    What is not written (None) keeps the default of the model's type.
     """
     for name in type_.__struct_fields__:
         value = getattr(section, name, None)
@@ -484,9 +481,6 @@ InterfaceReference = Annotated[
 ]
 
 
-Level = Literal["started", "configured", "connected", "active", "healthy"]
-"""What a node may be waited for to be (`model.Condition`)."""
-
 Names = Text | Annotated[tuple[Text, ...], Meta(min_length=1)]
 
 
@@ -610,7 +604,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     parameter_files: tuple[Text, ...] = ()
     remap: dict[Text, Text] = field(default_factory=dict)
-    after: dict[NodeKey, Level | Ready] = field(default_factory=dict)
+    after: dict[NodeKey, Condition | Ready] = field(default_factory=dict)
     timeouts: Timeouts = Timeouts()
     interface: Interface | InterfaceReference | None = None
     flows: Flows = Flows()

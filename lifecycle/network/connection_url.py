@@ -78,10 +78,6 @@ def _peer(name: str, value: str) -> Peer:
     return Peer(address=address, port=port)
 
 
-def _word(_: str, value: str) -> str:
-    return value
-
-
 def _prefix(name: str, value: str) -> str:
     if not _DISCOVERY_SERVER.fullmatch(value):
         raise ConnectionUrlError(
@@ -118,7 +114,9 @@ OPTIONS = {
     "server": Option(attribute="server", read=_peer, transports=_IP, repeated=True),
     "server_prefix": Option(attribute="server_prefix", read=_prefix, transports=_IP),
     "ttl": Option(attribute="ttl", read=functools.partial(_number, _TTLS), transports=_UDP),
-    "interface": Option(attribute="interfaces", read=_word, transports=_UDP, repeated=True),
+    "interface": Option(
+        attribute="interfaces", read=lambda _, value: value, transports=_UDP, repeated=True
+    ),
     "dscp": Option(attribute="dscp", read=functools.partial(_number, range(64)), transports=_UDP),
     "max_datagram_bytes": Option(
         attribute="max_datagram_bytes",

@@ -86,7 +86,6 @@ def _number(text: str) -> int | None:
 
 
 def _named(text: str) -> int:
-    """The DSCP with this name."""
     name = text.strip().upper().replace("_", "-")
     if (found := _by_name().get(name)) is not None:
         return found.dscp
@@ -184,11 +183,6 @@ def map_priority(priority: int, mapping: TransportPriorityMapping) -> MappedPrio
 
     Let n be the number of 4-bit right shifts until `mask & 0xffff0000` is 0. Then
     `TOS = ((priority & mask) >> 4n) * (high - low) / (mask >> 4n) + low`.
-
-    Args:
-        priority: the QoS value, a signed 32-bit `long` in DDS; its bits count.
-        mapping: the transport's three fields.
-
     """
     bits = priority & _BITS_32
     if mapping.mask == 0:

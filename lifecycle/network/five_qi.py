@@ -1,9 +1,8 @@
-"""5G QoS identifiers (5QIs): standardized classes, checks, proposals, and 5QI ↔ DSCP mappings.
+"""5G QoS identifiers (5QIs): standardized classes, checks, proposals, and 5QI → DSCP mappings.
 
 Owns: 3GPP TS 23.501 Table 5.7.4-1 as data with its sources, and the judgement whether a class can
-keep what a flow declares; reading mappings, published ones with their provenance and a user's own,
-and looking up in them. No mapping is the default, because none is normative: what a network does is
-configured in that network. Pure.
+keep what a flow declares; mappings, published ones with their provenance and a user's own. No
+mapping is the default, because none is normative. Pure.
 """
 
 from __future__ import annotations
@@ -39,7 +38,6 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
         packet_error_rate: upper bound of the share of packets lost or late, 0–1.
         max_data_burst_bytes: default volume served within the delay budget; None if not applicable.
         first_release: 3GPP release.
-        in_release_16: one of the 26 values that *Unique Network Flows* mentions.
         flagged: fields on which the sources disagree or that only a weak one supports.
         note: what is doubtful about the row; often empty.
     """
@@ -104,15 +102,7 @@ def check_class(
     rate_bps: float | None = None,
     message_bytes: int | None = None,
 ) -> tuple[ClassIssue, ...]:
-    """Return what a flow declares and the class does not keep; empty if it keeps all.
-
-    Args:
-        class_: the 5QI that the flow asks for.
-        max_delay_ms: declared bound of the delay, > 0, against the packet delay budget.
-        loss: declared bound of the loss, 0–1, against the packet error rate.
-        rate_bps: bits per second, > 0, against the type and the data burst volume.
-        message_bytes: largest message, > 0, against the data burst volume.
-    """
+    """Return what a flow declares and the class does not keep; empty if it keeps all."""
     found: list[ClassIssue] = []
 
     def issue(field: str, message: str) -> None:
@@ -172,7 +162,7 @@ def propose(
         loss: bound of the loss, > 0 and <= 1.
         gbr: True asks for a guaranteed bit rate, False for none, None for either.
         message_bytes: largest message that must arrive within the delay, > 0.
-        rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
+        rate_bps: bits per second that must be guaranteed, > 0.
     """
     fitting = [
         each
@@ -209,27 +199,13 @@ def propose(
 
 
 class DscpMapping(msgspec.Struct, frozen=True, kw_only=True):
-    """One mapping and its source.
+    """One mapping and its source: `{"name": …, "source": …, "values": {"85": "EF", "9": 0}}`.
 
     Attributes:
         source: who published it, where and when; for a user's own, who configured the network.
         status: how complete it is and in which direction it holds.
-        values: (5QI, DSCP 0–63) by rising 5QI.
+        values: DSCP, by name or number, of each 5QI.
     """
-
-    name: str
-    source: str
-    status: str
-    notes: tuple[str, ...]
-    values: tuple[tuple[int, int], ...]
-
-    def dscp_for(self, value: int) -> int | None:
-        """Return the DSCP of a 5QI; None if the mapping has none."""
-        return dict(self.values).get(value)
-
-
-class _File(msgspec.Struct, frozen=True, kw_only=True):
-    """A mapping as it is written, with names or numbers of DSCPs."""
 
     name: str
     source: str
@@ -237,15 +213,25 @@ class _File(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...] = ()
     values: dict[int, int | str]
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for an unknown 5QI, and for what is no DSCP."""
+        for value, dscp in self.values.items():
+            five_qi_of(value)
+            parse_dscp(dscp)
+
+    def dscp_for(self, value: int) -> int | None:
+        """Return the DSCP, 0–63, of a 5QI; None if the mapping has none."""
+        return parse_dscp(self.values[value]) if value in self.values else None
+
 
 class _MappingTable(msgspec.Struct, frozen=True, kw_only=True):
-    mappings: tuple[_File, ...]
+    mappings: tuple[DscpMapping, ...]
 
 
 @functools.cache
 def dscp_mappings() -> tuple[DscpMapping, ...]:
     """Return the published mappings that ship with the package."""
-    return tuple(_validated(each) for each in read_table("five_qi_dscp", _MappingTable).mappings)
+    return read_table("five_qi_dscp", _MappingTable).mappings
 
 
 def dscp_mapping(name: str) -> DscpMapping:
@@ -262,27 +248,12 @@ def dscp_mapping(name: str) -> DscpMapping:
 
 
 def parse_mapping(text: str | bytes) -> DscpMapping:
-    """Read a user's own mapping: `{"name", "source", "status", "notes", "values": {"85": "EF"}}`.
-
-    `name`, `source` and `values` are required; a DSCP may be a name or a number.
+    """Read a user's own mapping.
 
     Raises:
         ValueError: not JSON of that shape, an unknown 5QI, or not a DSCP.
     """
     try:
-        return _validated(from_json(text, _File))
+        return from_json(text, DscpMapping)
     except ValueError as error:
         raise ValueError(f"cannot read 5QI to DSCP mapping: {error}") from error
-
-
-def _validated(file: _File) -> DscpMapping:
-    return DscpMapping(
-        name=file.name,
-        source=file.source,
-        status=file.status,
-        notes=file.notes,
-        values=tuple(
-            (five_qi_of(value).value, parse_dscp(file.values[value]))
-            for value in sorted(file.values)
-        ),
-    )

@@ -102,11 +102,7 @@ class PortUse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def domain_base(domain_id: int) -> int:
-    """Return the first port of a domain, which is its discovery multicast port.
-
-    Raises:
-        ValueError: not 0–232.
-    """
+    """Return the first port of a domain, its discovery multicast port; ValueError beyond 0–232."""
     if not 0 <= domain_id <= MAX_DOMAIN_ID:
         raise ValueError(
             f"cannot use domain id {domain_id}: its ports would lie outside 1 to {MAX_PORT}; "
@@ -147,10 +143,7 @@ def participant_ports(domain_id: int, participant_id: int) -> ParticipantPorts:
 def unicast_pairs(
     domain_id: int, participants: int = PARTICIPANTS_PER_DOMAIN
 ) -> list[tuple[int, int]]:
-    """Return the ports for discovery and user data of the first participants of one host.
-
-    As many as exist: the highest domain has fewer.
-    """
+    """Return the ports for discovery and user data of the first participants of one host."""
     first = participant_ports(domain_id, 0)
     between = first.user_unicast - first.discovery_unicast
     end = min(first.discovery_unicast + PG * participants, MAX_PORT + 1 - between)
@@ -175,11 +168,7 @@ def owner_of(port: int) -> PortUse | None:
 def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
     """Return what else the unicast ports of this participant belong to, in the domains above.
 
-    Empty up to participant 119. Participant 120 of domain d overlaps with the multicast ports of
-    domain d + 1.
-
-    Raises:
-        ValueError: as `participant_ports`.
+    Empty up to participant 119; that after it has the multicast ports of the next domain.
     """
     ports = participant_ports(domain_id, participant_id)
     uses = (owner_of(ports.discovery_unicast), owner_of(ports.user_unicast))
@@ -204,22 +193,22 @@ def max_participants(domain_id: int, ephemeral: EphemeralRange) -> Capacity:
 
 
 def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
-    """Return the domain ids whose first participant is clear of the ephemeral ports, as runs.
-
-    0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
-    """
-    domains = range(MAX_DOMAIN_ID + 1)
-    safe = {each for each in domains if max_participants(each, ephemeral).participants}
-    first = [each for each in domains if each in safe and each - 1 not in safe]
-    last = [each for each in domains if each in safe and each + 1 not in safe]
-    return tuple(range(one, other + 1) for one, other in zip(first, last, strict=True))
+    """Return the domain ids whose first participant is clear of the ephemeral ports, as runs."""
+    found: list[range] = []
+    for domain in range(MAX_DOMAIN_ID + 1):
+        if not max_participants(domain, ephemeral).participants:
+            continue
+        if found and found[-1].stop == domain:
+            found[-1] = range(found[-1].start, domain + 1)
+        else:
+            found.append(range(domain, domain + 1))
+    return tuple(found)
 
 
 def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
     """Return this machine's real ephemeral range (ip(7), ip_local_port_range).
 
-    Args:
-        read: returns the text of a file by its path; injected, so that this room opens nothing.
+    `read` returns the text of a file, so that this room opens nothing.
 
     Raises:
         OSError: `read` could not; not Linux, or no /proc.

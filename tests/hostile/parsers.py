@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.status import NodeStatus, NodeStatusError, encode
 from lifecycle.graph.status import decode as decode_status
-from lifecycle.manifest.diagnostics import ManifestError, Position
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.installed_types import installed_hash
 from lifecycle.manifest.interface import read_interface
 from lifecycle.manifest.loading import load
@@ -77,7 +78,10 @@ def _installed(data: bytes, folder: Path) -> object:
 
 def _nodl(path: Path) -> object:
     at = Position(file="m.lifecycle.yaml", line=1, column=1)
-    return read_interface(f"local://{path.name}", base=path.parent, at=at)
+    found: list[Diagnostic] = []
+    return read_interface(
+        f"local://{path.name}", base=path.parent, at=at, environment=os.environ, found=found
+    )
 
 
 def _ledger(path: Path) -> object:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 
-from lifecycle.manifest.checks import connections, discovery, flows, names, nodes, parameters
+from lifecycle.manifest.checks import connections, discovery, flows, nodes, parameters, system
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, in_order
 from lifecycle.manifest.model import Manifest
 from lifecycle.manifest.parameter_files import ParameterFiles
 
 CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
-    *names.CHECKS,
+    *system.CHECKS,
     *connections.CHECKS,
     *nodes.CHECKS,
     *parameters.CHECKS,
@@ -38,13 +38,10 @@ def check(
         environment: for AMENT_PREFIX_PATH, ROS_DOMAIN_ID, RMW_IMPLEMENTATION and
             FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
         files: parameter files of its nodes that were read already.
-
-    Returns:
-        Every error and warning, in the order of their places in each document.
     """
-    system = DeclaredSystem.of(
+    declared = DeclaredSystem(
         manifest,
         environment=os.environ if environment is None else environment,
         files=files or ParameterFiles(manifest.path),
     )
-    return in_order((finding for each in CHECKS for finding in each(system)), [manifest.path])
+    return in_order((finding for each in CHECKS for finding in each(declared)), [manifest.path])

@@ -28,7 +28,7 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, check_together
+from lifecycle.network.connection_url import ConnectionUrlError, check_together
 from lifecycle.network.nfe import may_be_same
 from lifecycle.network.ports import DG, domain_base, owner_of
 
@@ -337,29 +337,25 @@ def check_urls(system: DeclaredSystem) -> Iterator[Diagnostic]:
 
 
 def _uses(system: DeclaredSystem) -> Iterator[_Use]:
-    for node in system.manifest.nodes:
-        for connection in node.connections:
-            for index, url in enumerate(connection.urls):
-                at = node.where(f"connections.{connection.name}.urls.{index}")
-                host = system.manifest.address_of(node.machine)
-                what = f"of connection {connection.name!r} of {node.key!r}"
-                yield from _ports(url, host, what, at)
-
-
-def _ports(url: ConnectionUrl, host: str, what: str, at: Position) -> Iterator[_Use]:
-    group = url.transport.is_group
-    for attribute, word in _WORDS.items():
-        port = getattr(url, attribute)
-        if port is not None:
-            yield _Use(
-                host=host,
-                tcp=url.transport.is_tcp,
-                group=group and attribute == "port",
-                address="" if group or attribute == "output_port" else url.address,
-                port=port,
-                what=f"{word} {what}",
-                at=at,
-            )
+    urls = (
+        (node, connection, index, url)
+        for node in system.manifest.nodes
+        for connection in node.connections
+        for index, url in enumerate(connection.urls)
+    )
+    for node, connection, index, url in urls:
+        group = url.transport.is_group
+        for attribute, word in _WORDS.items():
+            if (port := getattr(url, attribute)) is not None:
+                yield _Use(
+                    host=system.manifest.address_of(node.machine),
+                    tcp=url.transport.is_tcp,
+                    group=group and attribute == "port",
+                    address="" if group or attribute == "output_port" else url.address,
+                    port=port,
+                    what=f"{word} of connection {connection.name!r} of {node.key!r}",
+                    at=node.where(f"connections.{connection.name}.urls.{index}"),
+                )
 
 
 def _port_collisions(uses: list[_Use]) -> Iterator[Diagnostic]:

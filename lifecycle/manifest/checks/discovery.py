@@ -244,10 +244,7 @@ def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
 
 
 def check_middleware(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about what the RMW of a node cannot do; Fast DDS does all of it.
-
-    An error where a need that must be met certainly is not, else a warning.
-    """
+    """Yield findings about what the RMW of a node cannot do; Fast DDS does all of it."""
     for node in system.manifest.nodes:
         rmw = system.rmw_of(node)
         if rmw.startswith(FAST_DDS):
@@ -363,10 +360,7 @@ def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterat
 
 
 def _ipv6(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Warn of IPv6 machines under Fast DDS's default transports, which are IPv4 and shared memory.
-
-    Without IPv6 in them, participants neither find nor reach each other over such addresses.
-    """
+    """Warn of IPv6 machines under Fast DDS's default transports: IPv4 and shared memory."""
     discovery = system.manifest.discovery
     if discovery.mode is not DiscoveryMode.DYNAMIC or discovery.transport is not FlowTransport.ANY:
         return  # the planner gives participants what the addresses need
@@ -405,8 +399,7 @@ _SUPERVISOR = 1
 def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the domain, and about room for all participants.
 
-    The environment is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
-    for ROS_AUTOMATIC_DISCOVERY_RANGE, which holds where it leaves the range to the system.
+    ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE hold where the manifest leaves them open.
     """
     discovery = system.manifest.discovery
     domain = discovery.domain_id

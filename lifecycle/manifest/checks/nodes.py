@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.parameters import is_implicit, misfit, suggestion
@@ -130,7 +130,7 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
             message = f"cannot start {node.key!r} again whenever it ends: it may end by itself"
             hint = "write 'restart: on-failure', or remove 'may_end'"
             yield error("check.restart", places["restart"], message, hint)
-        yield from _delays(node, places)
+        yield from _delays(node)
 
 
 def check_health(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -210,7 +210,7 @@ def _never_deactivated(node: Node) -> str:
 _NOT_RESTARTED = "write 'restart: on-failure', or remove it"
 
 
-def _delays(node: Node, places: Mapping[str, Position]) -> Iterator[Diagnostic]:
+def _delays(node: Node) -> Iterator[Diagnostic]:
     """Judge the delays of a process that is started again."""
     how = node.supervision
     longest = how.restart_max_delay_sec
@@ -218,19 +218,19 @@ def _delays(node: Node, places: Mapping[str, Position]) -> Iterator[Diagnostic]:
         message = (
             f"cannot wait {longest:g} s at most: restart_sec is {how.restart_sec:g}, the shortest"
         )
-        at = places.get("restart_max_delay_sec", node.at)
+        at = node.where("restart_max_delay_sec")
         yield error("check.restart", at, message, "set restart_max_delay_sec >= restart_sec")
     elif longest is not None and longest > how.restart_sec and how.restart_steps == 0:
         message = f"cannot let the delay grow to {longest:g} s: no restart_steps say how fast"
-        at = places.get("restart_max_delay_sec", node.at)
+        at = node.where("restart_max_delay_sec")
         yield error("check.restart", at, message, "set 'restart_steps: 5' beside it")
     if how.restart_steps and longest is None:
         message = f"cannot let the delay grow in {how.restart_steps} steps: up to what is not said"
-        at = places.get("restart_steps", node.at)
+        at = node.where("restart_steps")
         yield error("check.restart", at, message, "set 'restart_max_delay_sec' beside it")
     elif how.restart_steps and not how.restart_sec:
         message = "cannot let the delay grow from 0 s: it grows by a factor"
-        at = places.get("restart_sec", node.at)
+        at = node.where("restart_sec")
         yield error("check.restart", at, message, "set 'restart_sec: 0.1' or more")
     least_s = how.restart_sec * how.start_limit_burst
     interval_s = how.start_limit_interval_sec
@@ -239,7 +239,7 @@ def _delays(node: Node, places: Mapping[str, Position]) -> Iterator[Diagnostic]:
             f"cannot reach the limit of {how.start_limit_burst} starts in {interval_s:g} s: with "
             f"restart_sec {how.restart_sec:g} they take {least_s:g} s, so it is never given up"
         )
-        at = places.get("start_limit_interval_sec", places.get("restart_sec", node.at))
+        at = node.positions.get("start_limit_interval_sec", node.where("restart_sec"))
         hint = f"set start_limit_interval_sec > {least_s:g}, or to 0 if that is meant"
         yield note("check.start-limit", at, message, hint)
 

@@ -86,11 +86,7 @@ def _given(node: Node) -> Iterator[Diagnostic]:
         at = node.where(f"parameters.{name}")
         declaration = declared.get(name)
         if declaration is not None:
-            if problem := misfit(value, declaration.type):
-                message = f"cannot set parameter {name!r} to {problem}"
-                yield error(
-                    "check.parameter-type", at, message, suggestion(value, declaration.type)
-                )
+            yield from _judge(value, declaration.type, repr(name), at)
         elif declared and not is_implicit(name) and f"parameters.{name}" not in node.shared:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
@@ -101,9 +97,14 @@ def _given(node: Node) -> Iterator[Diagnostic]:
         read = given_value(each.text)
         if declaration is None or read is None or each.node not in ("", node.name):
             continue
-        if problem := misfit(read, declaration.type):
-            message = f"cannot set parameter {each.name!r} of {node.key!r} by '-p' to {problem}"
-            yield error("check.parameter-type", at, message, suggestion(read, declaration.type))
+        what = f"{each.name!r} of {node.key!r} by '-p'"
+        yield from _judge(read, declaration.type, what, at)
+
+
+def _judge(value: ParameterValue, declared: str, what: str, at: Position) -> Iterator[Diagnostic]:
+    if problem := misfit(value, declared):
+        message = f"cannot set parameter {what} to {problem}"
+        yield error("check.parameter-type", at, message, suggestion(value, declared))
 
 
 def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
@@ -343,10 +344,7 @@ def _values(file: ParameterFile, node: Node) -> Iterator[Diagnostic]:
         for name, value, at in section.parameters:
             declaration = declared.get(name)
             if declaration is not None:
-                if problem := misfit(value, declaration.type):
-                    message = f"cannot set parameter {name!r} of {node.full_name!r} to {problem}"
-                    hint = suggestion(value, declaration.type)
-                    yield error("check.parameter-type", at, message, hint)
+                yield from _judge(value, declaration.type, f"{name!r} of {node.full_name!r}", at)
             elif declared and not section.is_wildcard and not is_implicit(name):
                 message = (
                     f"cannot set parameter {name!r} of {node.full_name!r}: "

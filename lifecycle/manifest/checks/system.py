@@ -1,10 +1,9 @@
-"""The manifest as the checks read it: endpoints with fully qualified names, implicit ones included.
+"""The manifest as the checks read it: endpoints with fully qualified names; checks of these names.
 
-Owns: resolving all names once, so that each check compares fully qualified names; an endpoint whose
-name cannot be resolved is left out here and reported by `names`. The names of the endpoints that
-every ROS 2 node, or every managed one, has without declaring them, so that what connects to them is
-not reported as unconnected. Sources: rcl's rosout and type description service, rclpy's parameter
-services, rcl_lifecycle's services and event. Pure.
+Owns: resolving all names once; illegal, duplicate, unused or colliding names and remap rules.
+The names of the endpoints that every ROS 2 node, or every managed one, has without declaring them
+(rcl's rosout and type description service, rclpy's parameter services, rcl_lifecycle's services and
+event), so that what connects to them is not reported as unconnected. Pure.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import LifecycleError
-from lifecycle.manifest.diagnostics import Position
+from lifecycle.errors import LifecycleError, did_you_mean
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, note, warning
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
@@ -34,9 +33,16 @@ from lifecycle.manifest.names import (
     MANAGED_SERVICES,
     NODE_SERVICES,
     OUR_SERVICES,
+    RemapKind,
     RemapRule,
+    expand,
+    hidden_names,
     name_in_graph,
+    name_problem,
+    namespace_problem,
+    node_name_problem,
     parse_rule,
+    remap_kind,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
@@ -64,44 +70,33 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
-class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
+class DeclaredSystem:
     """A manifest and what follows from it alone.
 
     Attributes:
-        endpoints: in the order of the manifest.
+        endpoints: in the order of the manifest; by remap rules that rcl reads.
         unresolved: those that have no name, and why.
         environment: of the process that will run the system.
         files: the parameter files that nodes name.
     """
 
-    manifest: Manifest
-    environment: Mapping[str, str]
-    files: ParameterFiles
-    endpoints: tuple[Resolved, ...]
-    unresolved: tuple[tuple[Node, Endpoint, LifecycleError], ...]
-
-    @classmethod
-    def of(
-        cls, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
-    ) -> DeclaredSystem:
-        """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
-        resolved: list[Resolved] = []
-        unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
+    def __init__(
+        self, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
+    ) -> None:
+        self.manifest = manifest
+        self.environment = environment
+        self.files = files
+        self.endpoints: list[Resolved] = []
+        self.unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
         for node in manifest.nodes:
             as_read = replace(node, remap=usable_rules(node))
             for endpoint in node.interface.endpoints:
-                name = _name(as_read, endpoint)
-                if isinstance(name, str):
-                    resolved.append(Resolved(node=node, endpoint=endpoint, name=name))
+                try:
+                    name = name_in_graph(as_read, endpoint.name, endpoint.kind)
+                except LifecycleError as problem:  # noqa: PERF203 - each is reported
+                    self.unresolved.append((node, endpoint, problem))
                 else:
-                    unresolved.append((node, endpoint, name))
-        return cls(
-            manifest=manifest,
-            environment=environment,
-            files=files,
-            endpoints=tuple(resolved),
-            unresolved=tuple(unresolved),
-        )
+                    self.endpoints.append(Resolved(node=node, endpoint=endpoint, name=name))
 
     @functools.cached_property
     def prefixes(self) -> tuple[Path, ...]:
@@ -147,14 +142,7 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     def names(self, kind: EndpointKind) -> tuple[str, ...]:
         """Return the fully qualified names that endpoints of one kind have."""
-        return self._names.get(kind, ())
-
-    @functools.cached_property
-    def _names(self) -> dict[EndpointKind, tuple[str, ...]]:
-        grouped: dict[EndpointKind, list[str]] = {}
-        for kind, name in self.by_name:
-            grouped.setdefault(kind, []).append(name)
-        return {kind: tuple(names) for kind, names in grouped.items()}
+        return tuple(name for of, name in self.by_name if of is kind)
 
     @functools.cached_property
     def is_open(self) -> bool:
@@ -162,13 +150,6 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return self.manifest.policy.undeclared_nodes is EndpointPolicy.OPEN or any(
             node.endpoints is EndpointPolicy.OPEN for node in self.manifest.nodes
         )
-
-
-def _name(node: Node, endpoint: Endpoint) -> str | LifecycleError:
-    try:
-        return name_in_graph(node, endpoint.name, endpoint.kind)
-    except LifecycleError as problem:
-        return problem
 
 
 def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
@@ -225,3 +206,210 @@ def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
         yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
         for name in supervisor_services(access, (each.name for each in manifest.modes)):
             yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
+
+
+_ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
+
+
+def check_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about the names of nodes and endpoints."""
+    for node in system.manifest.nodes:
+        yield from _illegal_node(node)
+    yield from _illegal_endpoints(system)
+    yield from _duplicate_nodes(system)
+    for group in system.by_name.values():
+        yield from _duplicate_endpoints(group)
+
+
+def _illegal_node(node: Node) -> Iterator[Diagnostic]:
+    if problem := node_name_problem(node.name):
+        message = f"cannot use {node.name!r} as the name of a node: {problem}"
+        yield error("check.name", node.where("name"), message)
+    if problem := namespace_problem(node.namespace):
+        message = f"cannot use {node.namespace!r} as a namespace: {problem}"
+        yield error("check.name", node.where("namespace"), message)
+
+
+def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    for node, endpoint, unresolved in system.unresolved:
+        noun = endpoint.kind.noun
+        if problem := name_problem(endpoint.name):
+            message = f"cannot use {endpoint.name!r} as the name of a {noun}: {problem}"
+            yield error("check.name", endpoint.at, message)
+        elif not node_name_problem(node.name) and not namespace_problem(node.namespace):
+            yield error("check.name", endpoint.at, unresolved.message, unresolved.hint)
+
+
+def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    first: dict[str, Node] = {}
+    for node in system.manifest.nodes:
+        other = first.setdefault(node.full_name, node)
+        if other is not node:
+            message = (
+                f"cannot run two nodes with the name {node.full_name!r}: "
+                f"{other.key!r} has it as well ({other.at.spelled})"
+            )
+            hint = "give one of them another 'name:' or 'namespace:'"
+            yield error("check.duplicate-node", node.at, message, hint)
+
+
+def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
+    """Judge endpoints of one kind and one name: twice in a node, or answered by several."""
+    first: dict[str, Resolved] = {}
+    for each in group:
+        other = first.setdefault(each.node.key, each)
+        noun = each.endpoint.kind.noun
+        if other is not each and not _remapped(each) and not _remapped(other):
+            message = (
+                f"cannot have two {noun}s {each.name!r} in one node: "
+                f"{other.endpoint.name!r} is the same ({other.at.spelled})"
+            )
+            yield error("check.duplicate-endpoint", each.at, message, "remove one")
+    servers = list(first.values())
+    if len(servers) > 1 and servers[0].endpoint.kind in _ANSWERING:
+        for each in servers[1:]:
+            message = (
+                f"cannot tell which of {len(servers)} servers answers {each.name!r}: "
+                f"{servers[0]} offers it as well"
+            )
+            hint = "move one of them with 'namespace:' or 'remap:'"
+            yield note("check.several-servers", each.at, message, hint)
+
+
+def _remapped(each: Resolved) -> bool:
+    """Whether a rule gave it its name; then `check_remaps` reports the rule."""
+    return expand(each.endpoint.name, each.node.name, each.node.namespace) != each.name
+
+
+def check_remaps(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about remap rules."""
+    resolved: dict[str, list[Resolved]] = {}
+    for each in system.endpoints:
+        resolved.setdefault(each.node.key, []).append(each)
+    for node in system.manifest.nodes:
+        rules: list[tuple[str, RemapRule]] = []
+        for match, replacement in node.remap:
+            rule = read_rule(match, replacement)
+            if isinstance(rule, LifecycleError):
+                yield error("check.remap-rule", _place(node, match), rule.message, rule.hint)
+            else:
+                rules.append((match, rule))
+        shared = {node.where(each) for each in node.shared}
+        # A rule for many nodes is one for those that have the name.
+        yield from (
+            finding
+            for finding in _unused(node, rules)
+            if finding.severity is Severity.ERROR or finding.at not in shared
+        )
+        yield from _collisions(node, resolved.get(node.key, []))
+
+
+def _place(node: Node, match: str) -> Position:
+    return node.where(f"remap.{match}")
+
+
+def _unused(node: Node, rules: list[tuple[str, RemapRule]]) -> Iterator[Diagnostic]:
+    names = _graph_names(node)
+    used = {id(_first(node, rules, name, kind)) for name, kind in names if name}
+    for match, rule in rules:
+        at = _place(node, match)
+        if rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
+            key = "name" if rule.kind is RemapKind.NODE_NAME else "namespace"
+            message = f"cannot remap {match!r} here: the manifest says who the node is"
+            yield error("check.remap-identity", at, message, f"write '{key}: {rule.replacement}'")
+        elif rule.node not in ("", node.name):
+            message = (
+                f"cannot apply the rule {match!r}: it is for node {rule.node!r}, "
+                f"this one is {node.name!r}"
+            )
+            yield warning("check.remap-unused", at, message, "remove the prefix, or the rule")
+        elif id(rule) not in used:
+            yield from _never_matches(node, match, rule, names)
+
+
+def _first(
+    node: Node, rules: list[tuple[str, RemapRule]], name: str, kind: RemapKind
+) -> RemapRule | None:
+    fitting = (rule for _, rule in rules if rule.applies_to(kind, node.name))
+    return next((rule for rule in fitting if _expanded(node, rule.match) == name), None)
+
+
+def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
+    """Return the names, before remapping, that rcl looks for a rule for."""
+    names = []
+    for endpoint in node.interface.endpoints:
+        expanded = _expanded(node, endpoint.name)
+        if endpoint.kind.is_action:
+            names += [(name, remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
+        else:
+            names.append((expanded, remap_kind(endpoint.kind)))
+    return names
+
+
+def _expanded(node: Node, name: str) -> str:
+    """Return the fully qualified name; empty for one that is not legal, which `names` reports."""
+    try:
+        return expand(name, node.name, node.namespace)
+    except LifecycleError:
+        return ""
+
+
+def _never_matches(
+    node: Node,
+    match: str,
+    rule: RemapRule,
+    names: list[tuple[str, RemapKind]],
+) -> Iterator[Diagnostic]:
+    at = _place(node, match)
+    wanted = _expanded(node, rule.match)
+    actions = [each.name for each in node.interface.endpoints if each.kind.is_action]
+    if not wanted:
+        return
+    if any(_expanded(node, name) == wanted for name in actions):
+        yield error(
+            "check.remap-action",
+            at,
+            f"cannot remap the action {wanted!r}: rcl remaps its hidden topics and services only",
+            f"remap {match}/_action/send_goal, …/cancel_goal, …/get_result, …/feedback and "
+            "…/status, or declare the action by its final name",
+        )
+    elif any(name == wanted and kind & rule.kind for name, kind in names):
+        message = f"cannot apply the rule {match!r}: an earlier rule for {wanted!r} always wins"
+        yield warning("check.remap-shadowed", at, message, "remove one of the two")
+    elif node.endpoints is EndpointPolicy.DECLARED:
+        known = [name for name, kind in names if kind & rule.kind]
+        message = f"cannot apply the rule {match!r}: no endpoint of the node is named {wanted!r}"
+        yield warning("check.remap-unused", at, message, did_you_mean(wanted, known))
+
+
+def _collisions(node: Node, resolved: list[Resolved]) -> Iterator[Diagnostic]:
+    """Refuse a rule that gives an endpoint the name of another one of its kind and node."""
+    first: dict[tuple[EndpointKind, str], Resolved] = {}
+    for each in resolved:
+        other = first.setdefault((each.endpoint.kind, each.name), each)
+        before = [expand(one.endpoint.name, node.name, node.namespace) for one in (other, each)]
+        if other is each or before == [each.name, each.name]:
+            continue
+        moved, stays = (each, other) if before[1] != each.name else (other, each)
+        message = (
+            f"cannot remap {each.endpoint.kind.noun} {moved.endpoint.name!r} onto {each.name!r}: "
+            f"{stays.endpoint.name!r} of the same node has that name ({stays.at.spelled})"
+        )
+        yield error("check.remap-collision", _rule_place(moved), message, "remap only one of them")
+
+
+def _rule_place(moved: Resolved) -> Position:
+    """Return the place of the rule that renamed an endpoint; the endpoint's if it is not plain."""
+    node = moved.node
+    expanded = expand(moved.endpoint.name, node.name, node.namespace)
+    for match, replacement in usable_rules(node):
+        rule = parse_rule(match, replacement)
+        if rule.match and _expanded(node, rule.match) == expanded:
+            return _place(node, match)
+    return moved.at
+
+
+CHECKS = (
+    check_names,
+    check_remaps,
+)

@@ -1,17 +1,15 @@
 """Launch-like arguments of a manifest, substitutions in its values, and `if:` and `unless:`.
 
-Owns: where argument values are taken from: given as `name:=value`, else the default; which nodes,
-includes and groups a document leaves out by their conditions, whose other substitutions are then
-not looked at; what a value becomes. What is inside `$(…)` is `substitutions`'. A substitution never
-adds structure: its text is never parsed as YAML again, it only takes the type of a scalar where it
-is one whole unquoted value.
+Owns: where argument values are taken from; which nodes, includes and groups a document leaves out
+by their conditions, whose other substitutions are then not looked at; what a value becomes. A
+substitution never adds structure: its text only takes the type of a scalar where it is one whole
+unquoted value.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
@@ -21,13 +19,11 @@ from lifecycle.manifest.yaml.document import (
     Place,
     Scalar,
     Value,
-    check_finite,
     quote,
     resolve,
 )
 from lifecycle.manifest.yaml.source import MAX_FINDINGS
 from lifecycle.manifest.yaml.substitutions import (
-    NOWHERE,
     NotRunError,
     Substitution,
     Surroundings,
@@ -46,49 +42,25 @@ _ARGV = ("command", "prefix")
 """Lists that are kept although a program that is not run would write one of their words."""
 
 
-class Substituted(msgspec.Struct, frozen=True, kw_only=True):
-    """A document without substitutions.
-
-    Attributes:
-        arguments: (name, value) in the order of declaration.
-        broken: values that could not be substituted, and what has a condition that could not be
-            read; they are reported in `diagnostics` and stay in `document` as written.
-        left_out: nodes, includes and groups whose condition does not hold. Nodes are no longer in
-            `document`; the others are, as written, so that those after them keep their numbers.
-    """
-
-    document: Document
-    arguments: tuple[tuple[str, str], ...]
-    diagnostics: tuple[Diagnostic, ...]
-    broken: tuple[Place, ...]
-    left_out: tuple[Place, ...] = ()
-
-
 def substitute(
     document: Document,
     given: Mapping[str, str],
-    surroundings: Surroundings = NOWHERE,
+    surroundings: Surroundings,
     *,
     include: Document | None = None,
 ) -> Substituted:
     """Resolve a document's arguments, then every substitution in its values.
 
     Args:
-        document: as read, not yet validated; what is malformed in `arguments:` is passed over, the
-            schema reports it.
+        document: as read; what is malformed in its `arguments:` is left to the schema.
         given: values by argument name, from the command line or from an including manifest.
         surroundings: what substitutions read from outside.
         include: the entry of the including manifest that gives the values.
     """
-    work = _Substitution(document, surroundings, include)
-    work.resolve_arguments(given)
-    return Substituted(
-        document=replace(document, root=work.value(document.root)),
-        arguments=tuple(work.values.items()),
-        diagnostics=tuple(work.found),
-        broken=tuple(work.broken),
-        left_out=tuple(work.left_out),
-    )
+    substituted = Substituted(document, surroundings, include)
+    substituted.resolve_arguments(given)
+    substituted.document = replace(document, root=substituted.value(document.root))
+    return substituted
 
 
 def _may_have_conditions(place: Place) -> bool:
@@ -98,18 +70,27 @@ def _may_have_conditions(place: Place) -> bool:
     return len(place) == 2 and place[0] in ("nodes", "include", "groups")
 
 
-class _Substitution:
-    """One run over one document."""
+class Substituted:
+    """A document without substitutions.
+
+    Attributes:
+        arguments: values by name, in the order of declaration.
+        found: what is wrong.
+        broken: values that could not be substituted, and what has a condition that could not be
+            read; they are in `found` and stay in `document` as written.
+        left_out: nodes, includes and groups whose condition does not hold. Nodes are no longer in
+            `document`; the others are, as written, so that those after them keep their numbers.
+    """
 
     def __init__(
         self, document: Document, surroundings: Surroundings, include: Document | None
     ) -> None:
-        self.values: dict[str, str] = {}
+        self.document = document
+        self.arguments: dict[str, str] = {}
         self.found: list[Diagnostic] = []
         self.broken: list[Place] = []
         self.left_out: dict[Place, None] = {}
-        self.open: set[Place] = set()
-        self._document = document
+        self._open: set[Place] = set()
         self._surroundings = surroundings
         self._include = include
         self._declared: tuple[str, ...] = ()
@@ -118,7 +99,7 @@ class _Substitution:
 
     def resolve_arguments(self, given: Mapping[str, str]) -> None:
         """Settle the value of each declared argument, in order; report what is wrong with any."""
-        section = self._document.find(("arguments",))
+        section = self.document.find(("arguments",))
         declared = section.data if section and isinstance(section.data, Mapping) else {}
         self._declared = tuple(declared)
         for name in given:
@@ -127,7 +108,7 @@ class _Substitution:
                     f"declared: {', '.join(declared)}" if declared else "the manifest declares none"
                 )
                 message = f"cannot set the argument {quote(name)}; {known}"
-                at = self._document.key_at(("arguments",))
+                at = self.document.key_at(("arguments",))
                 if self._include:
                     at = self._include.key_at(("arguments", name))
                 hint = did_you_mean(name, declared)
@@ -142,23 +123,23 @@ class _Substitution:
                 message = f"cannot set {name} to {quote(value)}: it is not UTF-8"
                 self._report("manifest.substitution", place, message)
                 continue
-            self.values[name] = value
+            self.arguments[name] = value
             self._check_choice(name, value, place)
 
     def _default(self, name: str, place: Place) -> str | None:
-        default = self._document.find((*place, "default"))
-        entry = self._document.find(place)
+        default = self.document.find((*place, "default"))
+        entry = self.document.find(place)
         keys = entry.data if entry and isinstance(entry.data, Mapping) else {"?": None}
         if default is None and not set(keys) <= {"description", "choices"}:
             return None
         if default is None:
-            about = self._document.find((*place, "description"))
+            about = self.document.find((*place, "description"))
             what = f" ({about.data})" if about and isinstance(about.data, str) else ""
             message = f"cannot do without a value for the argument {name!r}{what}"
             hint = f"give {name}:=VALUE on the command line, or a default here"
             if self._include:
                 hint = f"add it to the arguments of the include at {self._include.at().spelled}"
-            where = self._document.key_at(place)
+            where = self.document.key_at(place)
             self.found.append(error("manifest.missing-argument", where, message, hint))
             return None
         if isinstance(default.data, (tuple, Mapping)) or default.data is None:
@@ -167,7 +148,7 @@ class _Substitution:
         return None if (*place, "default") in self.broken else resolved.text
 
     def _check_choice(self, name: str, value: str, place: Place) -> None:
-        choices = self._document.find((*place, "choices"))
+        choices = self.document.find((*place, "choices"))
         if choices is None or not isinstance(choices.data, tuple) or not choices.data:
             return
         allowed = [each.text for each in choices.data]
@@ -179,21 +160,18 @@ class _Substitution:
                 did_you_mean(value, allowed),
             )
 
-    def _open(self, place: Place, problem: LifecycleError) -> None:
+    def _leave_open(self, place: Place, problem: LifecycleError) -> None:
         """Leave a value out that a program would write; what must be there is an error."""
         if "arguments" in place[:1] or place[-1] in CONDITIONS:
             self._report("manifest.command-not-run", place, problem.message, problem.hint)
             self.broken.append(place)
             return
-        self.open.add(place)
-        at = self._document.at(place)
+        self._open.add(place)
+        at = self.document.at(place)
         self.found.append(warning("manifest.command-not-run", at, problem.message, problem.hint))
 
     def _conditions(self, value: Value, place: Place) -> Value | None:
-        """Return what has `if:` or `unless:` with their values; None if it is left out.
-
-        Where one cannot be read it is `broken`.
-        """
+        """Return a value with its conditions read, which may be `broken`; None if left out."""
         if not isinstance(value.data, Mapping):
             return value
         written = [key for key in CONDITIONS if key in value.data]
@@ -240,8 +218,8 @@ class _Substitution:
             items = tuple(
                 self.value(each, (*place, index)) for index, each in enumerate(value.data)
             )
-            if place[-1] not in _ARGV and any((*place, i) in self.open for i in range(len(items))):
-                self.open.add(place)
+            if place[-1] not in _ARGV and any((*place, i) in self._open for i in range(len(items))):
+                self._open.add(place)
             return replace(value, data=items)
         if isinstance(value.data, Mapping):
             entries = {
@@ -253,7 +231,7 @@ class _Substitution:
                 data={
                     key: each
                     for key, each in entries.items()
-                    if (*place, key) not in self.open and (*place, key) not in self.left_out
+                    if (*place, key) not in self._open and (*place, key) not in self.left_out
                 },
             )
         if "$" not in value.text:
@@ -273,10 +251,9 @@ class _Substitution:
             # An empty string stays one, instead of becoming null.
             whole = len(parts) == 1 and isinstance(parts[0], Substitution)
             if whole and not value.quoted and text:
-                data = resolve(text)
-                check_finite(data, place)
+                data = resolve(text, place)
         except NotRunError as problem:
-            self._open(place, problem)
+            self._leave_open(place, problem)
             return value
         except LifecycleError as problem:
             if problem.message:
@@ -343,8 +320,8 @@ class _Substitution:
         return programs.output(words, self._surroundings.folder)
 
     def _argument(self, name: str, place: Place) -> str:
-        if name in self.values:
-            return self.values[name]
+        if name in self.arguments:
+            return self.arguments[name]
         if name not in self._declared:
             declared = ", ".join(self._declared)
             known = f"declared: {declared}" if declared else "none is declared"
@@ -365,7 +342,7 @@ class _Substitution:
         if len(self.found) == MAX_FINDINGS:
             rule, hint = "manifest.too-many", "fix these first"
             message = f"cannot list more than {MAX_FINDINGS} findings"
-        self.found.append(error(rule, self._document.at(place), message, hint))
+        self.found.append(error(rule, self.document.at(place), message, hint))
 
 
 def _encodable(text: str) -> bool:

@@ -24,8 +24,6 @@ from lifecycle.manifest.diagnostics import Position
 Scalar = bool | int | float | str | None
 """A scalar of YAML 1.2's core schema."""
 
-Plain = Scalar | list["Plain"] | dict[str, "Plain"]
-"""A value without positions, as a JSON Schema validator wants it."""
 
 Place = tuple[str | int, ...]
 """Keys and indices from the root of a document to a value."""
@@ -65,21 +63,8 @@ class Value(msgspec.Struct, frozen=True, kw_only=True):
     text: str = ""
     quoted: bool = False
 
-    def inside(self, place: Place) -> Value | None:
-        """Return the value at a place inside this one; None where there is none."""
-        value: Value | None = self
-        for step in place:
-            data = None if value is None else value.data
-            if isinstance(data, dict) and isinstance(step, str):
-                value = data.get(step)
-            elif isinstance(data, tuple) and isinstance(step, int):
-                value = data[step] if 0 <= step < len(data) else None
-            else:
-                return None
-        return value
-
     def plain(self, *, null: Any = None) -> Any:
-        """Return the value without positions, as `Plain`; `null` is put for each null."""
+        """Return lists, mappings and scalars without positions; `null` is put for each null."""
         if isinstance(self.data, tuple):
             return [each.plain(null=null) for each in self.data]
         if isinstance(self.data, dict):
@@ -108,7 +93,16 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
 
     def find(self, place: Place) -> Value | None:
         """Return the value at a place relative to `root`; None where there is none."""
-        return self.root.inside(place)
+        value: Value | None = self.root
+        for step in place:
+            data = None if value is None else value.data
+            if isinstance(data, dict) and isinstance(step, str):
+                value = data.get(step)
+            elif isinstance(data, tuple) and isinstance(step, int):
+                value = data[step] if 0 <= step < len(data) else None
+            else:
+                return None
+        return value
 
     def plain(self, place: Place = ()) -> Any:
         """Return the value at a place without positions; an empty mapping where there is none."""
@@ -195,14 +189,12 @@ _NOT_A_NUMBER = frozenset({".nan", ".NaN", ".NAN"})
 _LONGEST_INT = 80  # digits; int() is quadratic in them and refuses 4300, INT64_MIN has 19
 
 
-def resolve(text: str) -> Scalar:
-    """Return what the unquoted scalar `text` means.
-
-    `.inf` and `.nan` are doubles; where they may be written is `may_be_any_double`'s.
+def resolve(text: str, place: Place) -> Scalar:
+    """Return what the unquoted scalar `text` means at a place.
 
     Raises:
-        ValueError: a number that is too large for a double or does not fit into 64 bits; the
-            message is a phrase that follows "cannot use '…': ".
+        ValueError: a number that is too large for a double, does not fit into 64 bits or must be
+            finite there; the message is a phrase that follows "cannot use '…': ".
     """
     if text in _NULL:
         return None
@@ -219,6 +211,8 @@ def resolve(text: str) -> Scalar:
             return number
         raise ValueError(_FINITE)
     special = not_finite(text)
+    if special is not None and not may_be_any_double(place):
+        raise ValueError(_FINITE)
     return text if special is None else special
 
 
@@ -243,12 +237,6 @@ def may_be_any_double(place: Place) -> bool:
         or (each == "parameters" and (index == 0 or place[index - 1] not in _NAMED))
         for index, each in enumerate(place)
     )
-
-
-def check_finite(number: object, place: Place) -> None:
-    """Raise the ValueError of `resolve` for a number that must be finite at this place."""
-    if isinstance(number, float) and not math.isfinite(number) and not may_be_any_double(place):
-        raise ValueError(_FINITE)
 
 
 def has_leading_zero(text: str) -> bool:

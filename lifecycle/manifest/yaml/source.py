@@ -25,7 +25,6 @@ from lifecycle.manifest.yaml.document import (
     Place,
     Scalar,
     Value,
-    check_finite,
     quote,
     resolve,
     spell_place,
@@ -41,11 +40,7 @@ _NOT_TEXT = re.compile(
 
 
 def read_document(path: str | Path, *, shown: str = "") -> Document:
-    """Read one file as a YAML document whose root is a mapping.
-
-    Args:
-        path: the file.
-        shown: how messages name the file; the path itself if empty.
+    """Read one file as a YAML document whose root is a mapping; `shown` names it in messages.
 
     Raises:
         ManifestError: with the one reason why it cannot be read, or all doubled keys, tags and
@@ -57,11 +52,7 @@ def read_document(path: str | Path, *, shown: str = "") -> Document:
 
 
 def parse(text: str, *, file: str) -> Document:
-    """Parse text as a YAML document whose root is a mapping.
-
-    Raises:
-        ManifestError: see `read_document`.
-    """
+    """Parse text as `read_document` does."""
     document, findings = compose(text, file=file)
     if findings:
         raise ManifestError(findings)
@@ -192,11 +183,7 @@ _SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
 
 
 def events(text: str, *, file: str) -> Iterator[yaml.Event]:
-    """Yield the parser's events.
-
-    Raises:
-        ManifestError: the text is no YAML.
-    """
+    """Yield the parser's events; ManifestError where the text is no YAML."""
     try:
         yield from yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except yaml.YAMLError as problem:
@@ -209,19 +196,14 @@ def events(text: str, *, file: str) -> Iterator[yaml.Event]:
 
 
 def compose(text: str, *, file: str) -> tuple[Document, tuple[Diagnostic, ...]]:
-    """Read one YAML document.
-
-    Args:
-        text: decoded, without byte order mark.
-        file: path for messages.
+    """Read one YAML document; messages name it `file`.
 
     Returns:
         The document, and what is wrong with single values and keys: tags, merge keys, keys that
         are doubled or no strings, numbers out of range. Refused keys are left out.
 
     Raises:
-        ManifestError: not YAML, over a limit, or more or less than one document; with what was
-            found up to there.
+        ManifestError: not YAML, over a limit, or more or less than one document.
     """
     return _Composer(text, file).run()
 
@@ -316,8 +298,7 @@ class _Composer:
         data: Scalar = event.value
         if not quoted:
             try:
-                data = resolve(event.value)
-                check_finite(data, place)
+                data = resolve(event.value, place)
             except ValueError as problem:
                 message = f"cannot use {quote(event.value)}: {problem}"
                 self._note("yaml.number", mark, place, message)

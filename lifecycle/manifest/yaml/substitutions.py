@@ -1,10 +1,8 @@
 """Substitutions `$(…)` in values: their syntax, nested too; files read and programs run for them.
 
 Owns: the text of a value taken apart (`parse_text`), what `$(find-pkg-share …)`, `$(file …)` and
-`$(command …)` read from outside, each bounded in time and size, and the words of conditions. What
-`$(arg …)` is belongs to `arguments`. Nothing is computed: `$(eval …)` is refused.
-
-A program is run as its words stand, by no shell, once in a load however often it is written.
+`$(command …)` read from outside, each bounded in time and size, and the words of conditions. A
+program is run by no shell, once in a load however often it is written. Nothing is computed.
 """
 
 from __future__ import annotations
@@ -173,11 +171,7 @@ def truth(text: str) -> bool | None:
 
 
 def decide(kind: str, words: list[str], written: str) -> str:
-    """Return `true` or `false` of a `$(not …)`, `$(equals …)` and the others.
-
-    Raises:
-        LifecycleError: a word is neither true nor false.
-    """
+    """Return `true` or `false` of a `$(not …)`, `$(equals …)` and the others."""
     if kind in ("equals", "not-equals"):
         return _spelled((words[0] == words[1]) == (kind == "equals"))
     truths = [truth(each) for each in words]
@@ -212,9 +206,7 @@ class Programs:
     def output(self, words: list[str], folder: str) -> str:
         """Return what a program writes to its standard output, without the last line break.
 
-        Args:
-            words: program and arguments; no shell reads them.
-            folder: what it is started in, and where a relative program is looked for.
+        No shell reads `words`; `folder` is where it starts, and where a relative program is.
 
         Raises:
             LifecycleError: it is not there, fails, takes too long, or writes too much or no text.
@@ -317,11 +309,7 @@ class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
     programs: Programs | None
 
     def package_share(self, name: str) -> str:
-        """Return `PREFIX/share/NAME` of an installed package.
-
-        Raises:
-            LifecycleError: no prefix has it.
-        """
+        """Return `PREFIX/share/NAME` of a package; LifecycleError if no prefix has it."""
         prefixes = search_prefixes(self.environment)
         found = None
         if name and "/" not in name and "\0" not in name:
@@ -353,10 +341,6 @@ class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
                 reason = f"line {found.at.line}: {reason}"
             raise LifecycleError(f"cannot read {quote(path, limit=200)}: {reason}") from problem
         return _without_last_break(text)
-
-
-NOWHERE = Surroundings(environment={}, folder=os.curdir, programs=None)
-"""For documents that are not of a file."""
 
 
 def folder_of(path: Path) -> str:

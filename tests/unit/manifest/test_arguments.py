@@ -9,9 +9,12 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.yaml.arguments import MAX_TEXT, Substituted, substitute
 from lifecycle.manifest.yaml.source import parse
-from lifecycle.manifest.yaml.substitutions import NOWHERE
+from lifecycle.manifest.yaml.substitutions import Surroundings
 
 NONE: dict[str, str] = {}
+
+
+NOWHERE = Surroundings(environment={}, folder=".", programs=None)
 
 
 def _substitute(
@@ -24,7 +27,7 @@ def _substitute(
 def _value(written: str, value: str) -> object:
     """Return what `written` becomes with the argument `x` set to `value`."""
     result = _substitute(f"arguments: {{x: {{}}}}\nv: {written}\n", {"x": value})
-    assert result.diagnostics == ()
+    assert result.found == []
     found = result.document.find(("v",))
     assert found is not None
     return found.data
@@ -77,7 +80,7 @@ def test_an_unquoted_substitution_never_adds_structure(value: str) -> None:
     found = result.document.find(("v",))
     assert found is not None
     assert not isinstance(found.data, (tuple, dict))
-    assert found.data == value or not isinstance(found.data, str) or result.broken == (("v",),)
+    assert found.data == value or not isinstance(found.data, str) or result.broken == [("v",)]
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\r\n\0")))
@@ -87,18 +90,18 @@ def test_any_text_with_dollars_is_substituted_or_refused(text: str) -> None:
         document = parse(f"v: {quoted}\n", file="f")
     except Exception:  # noqa: BLE001 - not every character may stand in YAML
         return
-    result = substitute(document, {})
+    result = substitute(document, {}, NOWHERE)
     if "$(" not in text:
         assert result.document.find(("v",)) == document.find(("v",))
-    assert {each.at.path for each in result.diagnostics} <= {"v"}
-    assert all(each.message.startswith("cannot ") for each in result.diagnostics)
+    assert {each.at.path for each in result.found} <= {"v"}
+    assert all(each.message.startswith("cannot ") for each in result.found)
 
 
 def test_a_given_value_wins_over_the_default_and_the_order_is_that_of_declaration() -> None:
     text = "arguments: {a: {default: 1}, b: {default: 1.10}, c: {default: $(arg a)$(env E)}}\n"
     result = _substitute(text, {"a": "2"}, {"E": "e"})
-    assert result.diagnostics == ()
-    assert result.arguments == (("a", "2"), ("b", "1.10"), ("c", "2e"))
+    assert result.found == []
+    assert result.arguments == {"a": "2", "b": "1.10", "c": "2e"}
 
 
 def test_the_environment_wins_over_the_default() -> None:
@@ -110,17 +113,17 @@ def test_the_environment_wins_over_the_default() -> None:
 
 def test_a_value_that_failed_is_reported_once() -> None:
     result = _substitute("arguments: {a: {default: $(env NOT_SET)}}\nv: $(arg a)\nw: $(arg a)\n")
-    (only,) = result.diagnostics
+    (only,) = result.found
     assert str(only) == (
         "f:1:26: arguments.a.default: cannot find the environment variable 'NOT_SET'; "
         "set it, or write $(env NOT_SET DEFAULT)"
     )
-    assert result.broken == (("arguments", "a", "default"), ("v",), ("w",))
+    assert result.broken == [("arguments", "a", "default"), ("v",), ("w",)]
 
 
 def test_bytes_that_are_no_utf8_are_refused() -> None:
     result = _substitute("v: $(env E)\n", {}, {"E": "caf\udce9"})
-    assert [str(each) for each in result.diagnostics] == [
+    assert [str(each) for each in result.found] == [
         "f:1:4: v: cannot use 'caf\\udce9': it is not UTF-8"
     ]
 
@@ -128,7 +131,7 @@ def test_bytes_that_are_no_utf8_are_refused() -> None:
 def test_substitutions_cannot_blow_a_document_up() -> None:
     text = "arguments: {x: {}}\nv: [" + "$(arg x)," * 100 + "]\n"
     result = _substitute(text, {"x": "x" * (MAX_TEXT // 10)})
-    assert [each.message for each in result.diagnostics] == [
+    assert [each.message for each in result.found] == [
         f"cannot substitute more than {MAX_TEXT} characters in one document"
     ]
     assert len(result.broken) == 90

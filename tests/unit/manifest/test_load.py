@@ -463,7 +463,7 @@ def test_no_module_takes_the_place_of_yaml_until_that_is_loaded() -> None:
     # Python forgets an error, an interrupt too, that loads such a one when others import it.
     program = (
         "import sys, lifecycle.manifest.yaml.document as document; "
-        "print('yaml' in sys.modules, document.resolve('0x10'))"
+        "print('yaml' in sys.modules, document.resolve('0x10', ()))"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True

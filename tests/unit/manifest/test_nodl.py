@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.diagnostics import Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.interface import MAX_DOCUMENTS, read_interface
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
 from lifecycle.manifest.qos import (
@@ -49,9 +51,17 @@ parameters:
 """
 
 
+def followed(
+    reference: str, *, base: str | Path, at: Position, environment: Mapping[str, str] = os.environ
+) -> tuple[Interface, list[Diagnostic]]:
+    found: list[Diagnostic] = []
+    interface = read_interface(reference, base=base, at=at, environment=environment, found=found)
+    return interface, found
+
+
 def read(path: Path, text: str) -> tuple[Interface, list[str]]:
     path.write_text(text)
-    interface, found = read_interface(f"local://{path.name}", base=path.parent, at=AT)
+    interface, found = followed(f"local://{path.name}", base=path.parent, at=AT)
     return interface, [str(each).replace(f"{path.parent}/", "") for each in found]
 
 
@@ -198,7 +208,7 @@ def test_what_breaks_a_document_is_an_error_and_what_is_unknown_a_warning(
     tmp_path: Path, text: str, findings: list[str]
 ) -> None:
     (tmp_path / "x.yaml").write_text(text)
-    _, found = read_interface("local://x.yaml", base=tmp_path, at=AT)
+    _, found = followed("local://x.yaml", base=tmp_path, at=AT)
     places = [f"{each.at.line}:{each.at.column} {each.rule} {each.at.path}" for each in found]
     assert sorted(each.strip() for each in places) == findings
     assert {each.severity for each in found if each.rule != "nodl.invalid"} <= {Severity.WARNING}
@@ -259,14 +269,14 @@ def test_the_number_of_documents_is_bounded(tmp_path: Path) -> None:
         (tmp_path / f"n{index}.yaml").write_text(
             publisher(f"n{index}", f"local://n{index + 1}.yaml")
         )
-    interface, found = read_interface("local://n0.yaml", base=tmp_path, at=AT)
+    interface, found = followed("local://n0.yaml", base=tmp_path, at=AT)
     assert len(interface.endpoints) == MAX_DOCUMENTS
     assert [each.message for each in found] == ["cannot include more than 100 documents"]
 
 
 def test_a_missing_file_is_reported_at_the_reference_with_the_nearest_name(tmp_path: Path) -> None:
     (tmp_path / "camera.nodl.yaml").write_text(publisher("a"))
-    interface, found = read_interface("local://camra.nodl.yaml", base=tmp_path, at=AT)
+    interface, found = followed("local://camra.nodl.yaml", base=tmp_path, at=AT)
     assert interface == Interface(source="local://camra.nodl.yaml", has_all_parameters=True)
     assert [str(each).replace(f"{tmp_path}/", "") for each in found] == [
         (
@@ -287,13 +297,13 @@ def prefix(tmp_path: Path) -> Path:
 
 
 def test_a_document_is_found_in_the_ament_index(prefix: Path) -> None:
-    interface, found = read_interface(
+    interface, found = followed(
         "nodl://sensor_common/imu_driver",
         base="/nowhere",
         at=AT,
         environment={"AMENT_PREFIX_PATH": str(prefix)},
     )
-    assert ([each.name for each in interface.endpoints], found) == (["imu", "tf"], ())
+    assert ([each.name for each in interface.endpoints], found) == (["imu", "tf"], [])
 
 
 @pytest.mark.parametrize(
@@ -324,7 +334,7 @@ def test_a_reference_that_leads_nowhere_says_how_to_write_one(
     prefix: Path, reference: str, message: str
 ) -> None:
     environment = {"AMENT_PREFIX_PATH": str(prefix)}
-    _, found = read_interface(reference, base="/nowhere", at=AT, environment=environment)
+    _, found = followed(reference, base="/nowhere", at=AT, environment=environment)
     assert [str(each) for each in found] == [
         f"system.lifecycle.yaml:7:16: nodes.imu.interface: {message}"
     ]

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, may_be_any_double, resolve
 
+ANYWHERE = ("parameters",)
+
 
 @pytest.mark.parametrize(
     ("text", "value"),
@@ -33,7 +35,7 @@ from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, may_be_any_do
     ],
 )
 def test_the_core_schema(text: str, value: object) -> None:
-    resolved = resolve(text)
+    resolved = resolve(text, ANYWHERE)
     assert resolved == value
     assert type(resolved) is type(value)
 
@@ -62,25 +64,25 @@ def test_the_core_schema(text: str, value: object) -> None:
     ],
 )
 def test_what_only_yaml_1_1_knows_is_a_string(text: str) -> None:
-    assert resolve(text) == text
+    assert resolve(text, ANYWHERE) == text
 
 
 @pytest.mark.parametrize("text", ["1e999", "-1e999"])
 def test_numbers_are_finite(text: str) -> None:
     with pytest.raises(ValueError, match=r"^a number must be finite$"):
-        resolve(text)
+        resolve(text, ANYWHERE)
 
 
 @pytest.mark.parametrize(
     ("text", "value"), [(".inf", math.inf), ("-.Inf", -math.inf), ("+.INF", math.inf)]
 )
 def test_infinities_are_doubles(text: str, value: float) -> None:
-    assert resolve(text) == value
+    assert resolve(text, ANYWHERE) == value
 
 
 @pytest.mark.parametrize("text", [".nan", ".NaN", ".NAN"])
 def test_what_is_not_a_number_is_a_double(text: str) -> None:
-    assert math.isnan(resolve(text))  # type: ignore[arg-type]
+    assert math.isnan(resolve(text, ANYWHERE))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -102,17 +104,17 @@ def test_only_parameters_may_be_any_double(place: tuple[str | int, ...], may: bo
 @pytest.mark.parametrize("text", ["9223372036854775808", "-9223372036854775809", "9" * 5000])
 def test_integers_fit_into_64_bits(text: str) -> None:
     with pytest.raises(ValueError, match=r"^an integer must fit into 64 bits"):
-        resolve(text)
+        resolve(text, ANYWHERE)
 
 
 @given(st.integers(min_value=INT64_MIN, max_value=INT64_MAX))
 def test_every_int64_reads_back(number: int) -> None:
-    assert resolve(str(number)) == number
+    assert resolve(str(number), ANYWHERE) == number
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_double_reads_back(number: float) -> None:
-    resolved = resolve(repr(number))
+    resolved = resolve(repr(number), ANYWHERE)
     assert isinstance(resolved, float)
     assert resolved == number
     assert math.copysign(1, resolved) == math.copysign(1, number)
@@ -121,7 +123,7 @@ def test_every_double_reads_back(number: float) -> None:
 @given(st.text())
 def test_any_text_is_a_scalar_or_refused(text: str) -> None:
     try:
-        value = resolve(text)
+        value = resolve(text, ANYWHERE)
     except ValueError:
         return
     assert value is None or isinstance(value, (bool, int, float)) or value == text
