@@ -128,12 +128,8 @@ def is_running(run: Path) -> bool:
 def begin_logs(environment: Mapping[str, str], path: Path, system: str) -> None:
     """Make the directory of a run, have `latest` lead to it, and remove those of old runs.
 
-    What cannot be done is left: processes' logs say themselves that they cannot be written.
-
-    Args:
-        environment: may say in LIFECYCLE_KEEP_LOGS how many runs of the system are kept.
-        path: of the directory, in the ROS log directory.
-        system: name.
+    LIFECYCLE_KEEP_LOGS may say how many runs of the system are kept. What cannot be done is left:
+    processes' logs say themselves that they cannot be written.
     """
     with contextlib.suppress(OSError):
         path.mkdir(parents=True, exist_ok=True)
@@ -261,13 +257,6 @@ class LogDirectory:
 
     A log that cannot be written ends nothing: that is said once, what is missing is counted, in
     the file where it is missing, and said again once all of it can be written.
-
-    Args:
-        path: of the directory; it is made with the first log.
-        say: takes what a person should know.
-
-    Attributes:
-        path: as given.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
@@ -371,16 +360,7 @@ class RotatedFile:
 
 
 class ProcessLog:
-    """The output of one process, in two files of LARGEST_LOG at most.
-
-    Args:
-        directory: of the run.
-        process: its name.
-        kept: it has a file.
-
-    Attributes:
-        path: of the file.
-    """
+    """The output of one process; where it is kept, in two files of LARGEST_LOG at most."""
 
     def __init__(self, directory: LogDirectory, process: str, *, kept: bool = True) -> None:
         self._kept = kept
