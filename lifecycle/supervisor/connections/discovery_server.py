@@ -46,12 +46,7 @@ LOOK_AGAIN_S = 0.02
 
 
 async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
-    """Start the plan's discovery server, or wait for the one of another machine.
-
-    Args:
-        system: gets it as `system.server`.
-        spawner: starts it.
-        ours: it runs on a machine of this supervisor.
+    """Start the plan's discovery server, or wait for the one of another machine if not `ours`.
 
     Raises:
         StepFailedError: it cannot be started or ended again, or does not listen in time.

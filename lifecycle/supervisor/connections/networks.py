@@ -48,13 +48,7 @@ _SWEEP_S = 10.0
 
 
 class Networks:
-    """Networks of one run: the latest flows are programmed, in a thread.
-
-    Args:
-        system: its name, which failures are about.
-        directory: of the run.
-        emit: where notices go, and where verdicts come from.
-        programmer: None programs nothing.
+    """Networks of one run: the latest flows are programmed, in a thread; none without `programmer`.
 
     Raises:
         MiddlewareError: no thread can be started.
@@ -87,13 +81,9 @@ class Networks:
         Called for every gate that opens, a restart's and a resume's too. From now on every verdict
         is followed. Cancelled, it is over as soon as what is under way has been cut off.
 
-        Args:
-            verdict: has the flows.
-            timeout_s: what is left for it; None for the patience with each request.
-
         Raises:
-            BringUpError: a network could not be programmed, or not in time; what was made all
-                the same is removed by `close`.
+            BringUpError: a network could not be programmed, or not in time (None: the patience with
+                each request); what was made all the same is removed by `close`.
         """
         if self._programmer is None:
             return
@@ -114,8 +104,7 @@ class Networks:
     async def close(self, hurry: asyncio.Event) -> None:
         """Remove everything of the system from networks, bounded; failures become notices.
 
-        Args:
-            hurry: once set, no server is waited for any more.
+        Once `hurry` is set, no server is waited for any more.
         """
         self._begun = False
         removes: Removal | None = self._programmer
@@ -260,11 +249,7 @@ def open_networks(
 
 
 def remove_programmed(directory: Path, within_s: float) -> None:
-    """Remove everything that a run has in networks, also what a person applied.
-
-    Args:
-        directory: of the run.
-        within_s: for all that servers are asked.
+    """Remove everything that a run has in networks, also what a person applied, bounded.
 
     Raises:
         ProgrammingError: something could not be removed; it stays listed.

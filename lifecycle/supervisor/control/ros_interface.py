@@ -70,11 +70,7 @@ Answer = Callable[[bool, str], None]
 
 
 class RosInterface:
-    """What one run offers in ROS, from the moment that its system is active or held up.
-
-    Args:
-        supervisor: what is asked and ordered.
-    """
+    """What one run offers in ROS, from the moment that its system is active or held up."""
 
     def __init__(self, supervisor: Supervisor) -> None:
         self._supervisor = supervisor
@@ -202,12 +198,8 @@ def diagnostics(
 ) -> tuple[Entry, ...]:
     """Return one entry for each node, each measured flow with declared numbers, each rule broken.
 
-    Args:
-        status: of the system.
-        verdict: the last one; None before the first.
-        reported: what had an entry before; those of now are added.
-        label: what the names of entries begin with, which an aggregator knows them by.
-        source: their hardware id, by which those who read the health of nodes leave them out.
+    Those of now are added to `reported`. Names begin with `label`, which an aggregator knows them
+    by; those who read the health of nodes leave out entries of the hardware id `source`.
     """
     findings = () if verdict is None else verdict.findings
     entries = [

@@ -79,12 +79,7 @@ class LookAnswer(Answer, frozen=True, kw_only=True):
 
 
 class ControlServer:
-    """Answers on the control socket while the supervisor lives.
-
-    Args:
-        path: of the socket.
-        session: what is asked.
-    """
+    """Answers on the control socket while the supervisor lives."""
 
     def __init__(self, path: Path, session: Supervisor) -> None:
         self._path = path
@@ -214,11 +209,6 @@ _NOT_CHANGEABLE = ("policy.ros_interface",)
 
 def check(order: Order, system: System, machine: str) -> None:
     """Make sure that nothing but the manifest that an order means will run.
-
-    Args:
-        order: which.
-        system: what runs.
-        machine: of its supervisor, as it was given to `lifecycle up`.
 
     Raises:
         UsageError: the manifest has changed since the start, or cannot be taken.

@@ -140,13 +140,7 @@ _NESTED = (Operation.CONNECT, Operation.DISCONNECT)
 
 
 class NodeInterfaceClient:
-    """Wires a node through its node interface, in whichever process it is.
-
-    Args:
-        services: clients.
-        node: fully qualified name.
-        timeout_s: seconds, > 0, for each request.
-    """
+    """Wires a node through its node interface, in whichever process it is."""
 
     def __init__(self, services: NodeClients, node: str, timeout_s: float = _REQUEST_S) -> None:
         self._services = services
@@ -324,10 +318,6 @@ async def adopt(
     system: System, participant: ObserverParticipant
 ) -> tuple[Plan, tuple[Finding, ...]]:
     """Take the nodes of a system that run already as if its manifest attached to them.
-
-    Args:
-        system: nothing of which was started yet by this supervisor.
-        participant: shows what runs.
 
     Returns:
         The plan that attaches to them, and a finding for each node that runs more than once;

@@ -101,13 +101,9 @@ class SilenceMonitor:
     def fell_silent(
         self, nodes: Iterable[str], cause: Cause, detail: str, *, busy_s: float = 0.0
     ) -> None:
-        """Note that nodes are silent.
+        """Note that nodes are silent; `detail` is half a sentence.
 
-        Args:
-            nodes: their names.
-            cause: why.
-            detail: half a sentence.
-            busy_s: seconds for which a callback of theirs has been running.
+        A callback of theirs has been running for `busy_s` if they hang.
         """
         news = False
         for name in nodes:
@@ -337,11 +333,8 @@ class Answering:
     async def asked(self, timeout_s: float) -> bool:
         """Wait, bounded, until it is known of each node that is there whether it answers.
 
-        Args:
-            timeout_s: seconds; who has not answered by then counts as one that does not.
-
-        Returns:
-            Whether any had to be waited for: what was seen before is older than the answers.
+        Who has not answered in time counts as one that does not. Returns whether any had to be
+        waited for: what was seen before is older than the answers.
         """
         loop, liveliness = asyncio.get_running_loop(), self._system.liveliness
         limit_s = max(_LEAST_S, min(timeout_s, _GATE_S))

@@ -127,10 +127,10 @@ class Marks:
     def follow(
         self, flows: Iterable[FlowReport], machines: Mapping[str, str], own: Collection[str]
     ) -> None:
-        """Take the flows as they were verified just now.
+        """Take the flows of the system as they were verified just now.
 
         Args:
-            flows: all of the system.
+            flows: all of them.
             machines: of each node, by its full name.
             own: machines that are ours.
         """

@@ -103,11 +103,7 @@ class ObserverParticipant:
         return cls(graph)
 
     async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
-        """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
-
-        Args:
-            wait_s: seconds, > 0, that it may take.
-        """
+        """Return the nodes once discovery has settled, and what it lacked in the end."""
         (nodes, _), unsettled = await settled(self.discovery, wait_s)
         return nodes, unsettled
 
@@ -156,12 +152,7 @@ Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 
 async def settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
-    """Wait until the graph changes no more; return it, and what it still lacked in the end.
-
-    Args:
-        graph: to look at.
-        wait_s: seconds, > 0, that it may take.
-    """
+    """Wait until the graph changes no more; return it, and what it still lacked in the end."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     changed = asyncio.Event()

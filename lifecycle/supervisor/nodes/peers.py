@@ -105,12 +105,7 @@ class _Peer(msgspec.Struct):
 
 
 class Peers:
-    """What a system depends on beside its own processes; `open` it in a loop and `close` it.
-
-    Args:
-        system: ours.
-        participant: carries what is announced.
-    """
+    """What a system depends on beside its own processes; `open` it in a loop and `close` it."""
 
     def __init__(self, system: System, participant: ObserverParticipant) -> None:
         self._system = system

@@ -323,12 +323,7 @@ class System:
         operation: Operation,
         apart: Callable[[ManagedProcess], tuple[str, ...]] = lambda _: (),
     ) -> None:
-        """Have our hosts do something with all of their process; nothing waits for it.
-
-        Args:
-            operation: of a whole process.
-            apart: of a process, see `Command`.
-        """
+        """Have our hosts do something with all of their process; nothing waits for it."""
         for each in self.processes.values():
             if each.channel is not None and not each.ended.done():
                 node = self.nodes[each.planned.nodes[0]].name
@@ -404,11 +399,8 @@ class System:
 
         A host reports every change by itself; one that has not begun to is asked, and does not
         hold up a look for long. A node that does not answer keeps its last configuration: that it
-        is gone is for the graph and its process to say.
-
-        Args:
-            observer: see above.
-            marks: ask those, too, of which a DSCP is declared: no event says that another was set.
+        is gone is for the graph and its process to say. With `marks` those are asked, too, of
+        which a DSCP is declared: no event says that another was set.
         """
         nodes = [
             node

@@ -109,11 +109,7 @@ class ControlChannel:
         await asyncio.shield(self._ready)
 
     async def request(self, command: Command, permit: Permit | None = None) -> Event:
-        """Ask one node for one operation and wait for its reply.
-
-        Args:
-            command: what to do.
-            permit: needed for ACTIVATE, and for nothing else.
+        """Ask one node for one operation and wait for its reply; only ACTIVATE needs a permit.
 
         Raises:
             ChannelClosedError: the host ended before it replied.

@@ -158,11 +158,8 @@ class ForkServer:
     ) -> int:
         """Fork one process, in a session of its own; return its pid. Its end settles it.
 
-        Args:
-            process: what to start.
-            streams: descriptors for its standard output and error; not closed here.
-            control: descriptor of the host's end of the control channel; None for a foreign
-                command.
+        `streams` are descriptors for its standard output and error, `control` that of the host's
+        end of the control channel, None for a foreign command; they are not closed here.
 
         Raises:
             BringUpError: the fork server is gone, or the system is out of processes.
@@ -216,10 +213,7 @@ class ForkServer:
         """Return the pids of all that processes have started, whether they live or not.
 
         It belongs to one if it descends from it, is in its session or group, carries its name in
-        its environment, or descends from one of these.
-
-        Args:
-            processes: names of planned processes by pid.
+        its environment, or descends from one of these. `processes` are names by pid.
         """
         lineage = Lineage()
         others = {each.pid for each in self._children.values()} - processes.keys()
@@ -237,11 +231,9 @@ class ForkServer:
     async def end_left(
         self, ended: Mapping[int, str], known: Collection[int] = ()
     ) -> tuple[int, ...]:
-        """End, bounded, what processes have left that have ended; return the pids.
+        """End, bounded, what processes that `ended` have left; return the pids.
 
-        Args:
-            ended: their names by pid.
-            known: pids of what belonged to them before.
+        Pids of what belonged to them before are `known`.
         """
         return await _until_none(lambda: self.belonging(ended) | (set(known) & self.family()))
 

@@ -125,10 +125,11 @@ def is_running(run: Path) -> bool:
     return named is not None and Path(f"/proc/{named['pid']}").exists()
 
 
-def begin_logs(path: Path) -> Path:
-    """Make and return the directory of a run, and have `latest` lead to it.
+def begin_logs(environment: Mapping[str, str], path: Path, system: str) -> None:
+    """Make the directory of a run, have `latest` lead to it, and remove those of old runs.
 
-    What cannot be done is left: processes' logs say themselves that they cannot be written.
+    LIFECYCLE_KEEP_LOGS may say how many runs of the system are kept. What cannot be done is left:
+    processes' logs say themselves that they cannot be written.
     """
     with contextlib.suppress(OSError):
         path.mkdir(parents=True, exist_ok=True)
@@ -137,22 +138,9 @@ def begin_logs(path: Path) -> Path:
             made = path.parent / f".{LATEST}-{os.getpid()}"
             made.symlink_to(path.name)
             made.replace(link)
-    return path
-
-
-def forget_runs(root: Path, system: str, environment: Mapping[str, str]) -> None:
-    """Remove the logs of a system's runs but the newest; what cannot be removed stays.
-
-    It blocks, 15 ms among the 30,000 files of a ROS log directory that nobody has tidied.
-
-    Args:
-        root: the ROS log directory.
-        system: name.
-        environment: may say in LIFECYCLE_KEEP_LOGS how many are kept.
-    """
     given = environment.get("LIFECYCLE_KEEP_LOGS", "")
     keep = int(given) if given.isascii() and given.isdigit() and int(given) else KEPT_RUNS
-    for each in runs_of(root, system)[keep:]:
+    for each in runs_of(path.parent, system)[keep:]:
         with contextlib.suppress(OSError):
             _remove_run(each, system)
 
@@ -269,13 +257,6 @@ class LogDirectory:
 
     A log that cannot be written ends nothing: that is said once, what is missing is counted, in
     the file where it is missing, and said again once all of it can be written.
-
-    Args:
-        path: of the directory; it is made with the first log.
-        say: takes what a person should know.
-
-    Attributes:
-        path: as given.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
@@ -379,16 +360,7 @@ class RotatedFile:
 
 
 class ProcessLog:
-    """The output of one process, in two files of LARGEST_LOG at most.
-
-    Args:
-        directory: of the run.
-        process: its name.
-        kept: it has a file.
-
-    Attributes:
-        path: of the file.
-    """
+    """The output of one process; where it is kept, in two files of LARGEST_LOG at most."""
 
     def __init__(self, directory: LogDirectory, process: str, *, kept: bool = True) -> None:
         self._kept = kept

@@ -289,11 +289,7 @@ def scope(resources: Resources | None) -> tuple[str, ...]:
 
 
 def unlimited(processes: Iterable[PlannedProcess]) -> tuple[Finding, ...]:
-    """Return an unverifiable finding for each of these processes that nothing limits as declared.
-
-    Args:
-        processes: of this host.
-    """
+    """Return an unverifiable finding for each process here that nothing limits as declared."""
     limited = [
         (each.name, each.run.resources)
         for each in processes

@@ -58,13 +58,8 @@ def with_failures(
 ) -> Verdict:
     """Return `verdict`, violated, with all that failed as its first findings, each once.
 
-    What only follows from a process that ended is not said again: that its nodes are not there, and
-    that others lack what they brought along.
-
-    Args:
-        verdict: the last one.
-        failures: see above.
-        gone: full names of the nodes that are not there any more, as their process has ended.
+    What only follows from a process that ended is not said again: that its nodes (full names in
+    `gone`) are not there, and that others lack what they brought along.
     """
     findings = tuple({(each.rule, each.subject): finding_of(each) for each in failures}.values())
     named = {(each.rule, each.subject) for each in findings}
@@ -78,12 +73,7 @@ def with_failures(
 
 
 def result_of(system: System, latest: Verdict) -> UpResult:
-    """Return the result of a run that is over.
-
-    Args:
-        system: what ran.
-        latest: the verdict by which it began to end.
-    """
+    """Return the result of a run that is over; `latest` is the verdict by which it began to end."""
     run = system.run
     ending = run.ending
     assert ending is not None

@@ -81,13 +81,7 @@ class JournalLine(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Journal:
-    """Writes a run's journal; what cannot be written is said once, and is missing there.
-
-    Args:
-        system: its name.
-        run_id: of the run.
-        say: takes what a person should know.
-    """
+    """Writes a run's journal; what cannot be written is said once, and is missing there."""
 
     def __init__(
         self,
@@ -177,10 +171,7 @@ class RecordedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def journal_files(path: Path) -> tuple[Path, ...]:
-    """Return the files of a journal, oldest first.
-
-    Args:
-        path: of a run's log directory, or of one file.
+    """Return the files of a journal, oldest first, by a run's log directory or one of the files.
 
     Raises:
         UsageError: there is none.

@@ -82,11 +82,10 @@ class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
         return TIMEOUT_S + processes * STARTING_S if self.timeout_s is None else self.timeout_s
 
     def gate_s(self, left_s: float) -> float:
-        """Return the seconds that a connected system has until it is active.
+        """Return the seconds that a connected system has until it is active, of those left.
 
-        Args:
-            left_s: of the bring-up. Only with a timeout that was asked for may they all be used:
-                what contradicts a large system is not to be waited for longer than in a small one.
+        Only with a timeout that was asked for may they all be used: what contradicts a large system
+        is not to be waited for longer than in a small one.
         """
         return min(left_s, TIMEOUT_S) if self.timeout_s is None else left_s
 
@@ -106,9 +105,7 @@ class UpResult(msgspec.Struct, frozen=True, kw_only=True):
 def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
     """Return the names of the machines whose supervisor this is; empty for nodes that name none.
 
-    Args:
-        plan: the whole system, planned or as its manifest says.
-        machine: a machine of it; empty for every machine whose address is this host's.
+    Without `machine` these are all whose address is this host's.
 
     Raises:
         UsageError: the plan has no such machine.
@@ -131,10 +128,6 @@ def address_that_is_down(plan: Plan, machine: str) -> str:
 
     What an interface is needed for is a node of another machine. Fast DDS looks for interfaces when
     it makes a participant, and never again: one that is made while a cable is out stays alone.
-
-    Args:
-        plan: the whole system.
-        machine: as for `own_machines`.
     """
     own = own_machines(plan, machine)
     if all(each.machine in own for each in plan.nodes):
@@ -153,10 +146,6 @@ def address_that_is_down(plan: Plan, machine: str) -> str:
 
 def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:
     """Return the processes that this supervisor starts or attaches to.
-
-    Args:
-        plan: the whole system.
-        machine: as for `own_machines`.
 
     Raises:
         UsageError: the plan has no such machine, or nothing of it is for this host.
@@ -198,11 +187,8 @@ def onlooker_connections(
     """Return how an observer beside the supervisor of this host is connected.
 
     As that one is, but on ports that are free: replies go to wherever it asks from. By TCP nodes
-    dial the supervisor, and none dials an observer beside it: it dials all that listen.
-
-    Args:
-        plan: of the system.
-        reported: what nodes report: one that was restarted listens elsewhere than planned.
+    dial the supervisor, and none dials an observer beside it: it dials all that listen, also by
+    what nodes reported: one that was restarted listens elsewhere than planned.
     """
     connections = observer_connections(plan)
     planned = [url for node in plan.nodes for url in urls_of(node)]

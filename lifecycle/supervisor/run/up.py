@@ -11,11 +11,9 @@ import contextlib
 import gc
 import os
 import re
-import threading
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -64,23 +62,18 @@ from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     begin_logs,
     check_log_root,
-    forget_runs,
     log_directory,
 )
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
-    Failure,
     Listener,
     Notice,
     RunStarted,
-    Stopping,
-    SystemReached,
 )
 from lifecycle.supervisor.run.failure import StepFailedError, ended_early
 from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
-    Until,
     UpOptions,
     UpResult,
     address_that_is_down,
@@ -170,7 +163,8 @@ def up(
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             leaving.callback(service.watch())
-            logs = begin_logs(log_directory(os.environ, plan.system))
+            logs = log_directory(os.environ, plan.system)
+            begin_logs(os.environ, logs, plan.system)
             system = System(
                 plan,
                 emit=emit,
@@ -182,7 +176,6 @@ def up(
             )
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
-            leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
@@ -240,30 +233,6 @@ class _Guarded:
         """Raise what the listener raised."""
         if self._error is not None:
             raise self._error
-
-
-@contextlib.contextmanager
-def _forgetting_runs(emit: Emitter, logs: Path, system: str) -> Iterator[None]:
-    """Remove old logs once bring-up is over, in a thread of its own: a disk may be slow."""
-    begun: list[threading.Thread] = []
-
-    def on_event(event: Event) -> None:
-        is_up = isinstance(event, SystemReached) and event.reached == Until.ACTIVE.value
-        if not begun and (is_up or isinstance(event, (Failure, Stopping))):
-            work = (logs.parent, system, dict(os.environ))
-            begun.append(threading.Thread(target=forget_runs, args=work, daemon=True))
-            with contextlib.suppress(RuntimeError):  # no room for a thread: the next run does it
-                begun[0].start()
-
-    emit.listen(on_event)
-    yield
-    for each in begun:
-        if each.is_alive():
-            each.join(_FORGOTTEN_S)
-
-
-_FORGOTTEN_S = 1.0
-"""What is not removed then is left to the next run."""
 
 
 async def _leaving_last(

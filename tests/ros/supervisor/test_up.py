@@ -425,24 +425,15 @@ def _logs_of_a_run_before(tmp_path: Path, system: str) -> Path:
 
 
 @pytest.mark.thorough
-def test_logs_of_old_runs_go_once_the_system_is_active_or_is_not_going_to_be(
-    tmp_path: Path, fresh_domain: int, wait_until: Callable[..., None]
+def test_logs_of_old_runs_of_the_same_system_go_when_it_is_started(
+    tmp_path: Path, fresh_domain: int
 ) -> None:
     keeping = {"LIFECYCLE_KEEP_LOGS": "1"}
     old = _logs_of_a_run_before(tmp_path, "pair")
     other = _logs_of_a_run_before(tmp_path, "other")
-    manifest = pair(tmp_path, fresh_domain, misbehave="activate:hang")
-    with up(manifest, runtime=tmp_path, variables=keeping) as run:
-        run.until("log", line="about to hang in activate")
-        assert old.is_dir()
-        run.signal(signal.SIGINT)
-        assert run.finish() == ExitCode.INTERRUPTED
-        assert not old.exists()
-        run.assert_nothing_left()
-    old = _logs_of_a_run_before(tmp_path, "pair")
     with up(pair(tmp_path, fresh_domain), runtime=tmp_path, variables=keeping) as run:
         run.until("system", reached="active")
-        wait_until(lambda: not old.exists())
+        assert not old.exists()
         run.signal(signal.SIGINT)
         assert run.finish() == ExitCode.INTERRUPTED
     assert other.is_dir()

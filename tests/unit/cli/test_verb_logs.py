@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from lifecycle.cli.verbs.logs import command
 from lifecycle.errors import UsageError
-from lifecycle.supervisor.processes.logs import begin_logs, forget_runs, runs_of
+from lifecycle.supervisor.processes.logs import begin_logs, runs_of
 
 GONE = 2**22 + 1
 """More than any pid, proc(5)."""
@@ -130,10 +130,8 @@ def test_the_latest_run_is_linked_and_old_ones_of_its_system_go(root: Path) -> N
     (foreign / "bag.db3").write_text("somebody's")
     old, kept, other = run(root, 3, talker="old\n"), run(root, 4), run(root, 1, "other")
     new = root / f"2026-11-05-10-00-00-000000-my-host-{os.getpid()}-pair"
-    begin_logs(new)
+    begin_logs({"LIFECYCLE_KEEP_LOGS": "2"}, new, "pair")
     assert (root / "latest").resolve() == new
-    assert old.is_dir()
-    forget_runs(root, "pair", {"LIFECYCLE_KEEP_LOGS": "2"})
     assert runs_of(root, "pair") == [new, kept, foreign, alive]
     assert other.is_dir()
     assert not old.exists()
@@ -143,13 +141,13 @@ def test_the_run_that_began_last_is_the_newest_also_after_the_clock_was_set_back
     root: Path,
 ) -> None:
     later = run(root, 4, talker="before\n")
-    begun = begin_logs(run(root, 2, talker="after\n"))
-    forget_runs(root, "pair", {"LIFECYCLE_KEEP_LOGS": "1"})
+    begun = run(root, 2, talker="after\n")
+    begin_logs({"LIFECYCLE_KEEP_LOGS": "1"}, begun, "pair")
     assert runs_of(root, "pair") == [begun]
     assert not later.exists()
 
 
 def test_a_directory_named_latest_that_is_no_link_stays(root: Path) -> None:
     (root / "latest").mkdir()
-    begin_logs(root / f"2026-11-05-10-00-00-000000-h-{GONE}-pair")
+    begin_logs({}, root / f"2026-11-05-10-00-00-000000-h-{GONE}-pair", "pair")
     assert not (root / "latest").is_symlink()
