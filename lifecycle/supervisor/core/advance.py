@@ -353,7 +353,7 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
 
 def _barks_at_s(run: Run, process: Process) -> float:
     """Return when the watchdog of a process ends it; NEVER_S while none of its nodes hangs."""
-    how = process.policy.how
+    how = process.how
     if not how.watchdog_sec or how.restart is Restart.NO:
         return NEVER_S
     members = run.nodes_of(process.name)

@@ -468,7 +468,7 @@ def _returned(run: Run) -> list[Event]:
                 Restarted(
                     process=process.name,
                     nodes=tuple(each.name for each in members),
-                    restarts=process.policy.restarts,
+                    restarts=process.restarts,
                     took_s=run.now_s - process.away_s,
                 )
             )

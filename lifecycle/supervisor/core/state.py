@@ -30,7 +30,6 @@ from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.verdict import FindingKey, FlowReport, Verdict
@@ -242,7 +241,10 @@ class Process(msgspec.Struct, kw_only=True):
         end: how it ended; None while it has not.
         log: file with its output; empty before it was started.
         sweeping: what it left is being ended, and forgotten by the graph.
-        policy: when it is started again, over all of its lives.
+        how: it is supervised, as the manifest says.
+        restarts: how often it was started again after a failure.
+        starts: when it was started, by all that its start limit counts.
+        in_a_row: its failures without a long run between them.
         by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
@@ -253,7 +255,7 @@ class Process(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedProcess
-    policy: RestartPolicy
+    how: Supervision
     may_end: bool = False
     state: ProcessState | None = None
     pid: int = 0
@@ -261,6 +263,9 @@ class Process(msgspec.Struct, kw_only=True):
     log: str = ""
     sweeping: bool = False
     by_hand: bool = True
+    restarts: int = 0
+    starts: list[float] = []
+    in_a_row: int = 0
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
@@ -277,9 +282,11 @@ class Process(msgspec.Struct, kw_only=True):
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
         if self.by_hand:
-            self.policy.reset(now_s)
-        else:
-            self.policy.started(now_s, after_failure=self.failed)
+            self.starts, self.in_a_row = [], 0
+        self.restarts += self.failed and not self.by_hand
+        # Without a limit they are not counted, and must not pile up.
+        kept = self.starts if self.how.start_limit_interval_sec else []
+        self.starts = [*kept, now_s]
         self.failed = self.by_hand = False
 
     def restarted_by_hand(self) -> None:
@@ -729,10 +736,8 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         started = planned.run.kind is not RunKind.ATTACH
         if started:
             supervision = members[0].supervision if members else Supervision()
-            process = processes.get(planned.name) or Process(
-                planned=planned, policy=RestartPolicy(supervision)
-            )
-            process.planned, process.policy.how = planned, supervision
+            process = processes.get(planned.name) or Process(planned=planned, how=supervision)
+            process.planned, process.how = planned, supervision
             process.may_end = bool(members) and all(each.may_end for each in members)
             run.processes[planned.name] = process
         for each in members:
