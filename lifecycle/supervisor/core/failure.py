@@ -17,7 +17,7 @@ from lifecycle.supervisor.control.protocol import ControlRequest, Failed, Proces
 from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, late_at_s, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
-from lifecycle.supervisor.core.inputs import Exited
+from lifecycle.supervisor.core.messages import Exited
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,

@@ -12,7 +12,7 @@ from collections.abc import Collection
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.core.inputs import Verified
+from lifecycle.supervisor.core.messages import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
 from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, with_only

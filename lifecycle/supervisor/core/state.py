@@ -13,6 +13,7 @@ from __future__ import annotations
 import enum
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -29,10 +30,12 @@ from lifecycle.manifest.model import (
 from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
-from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.verdict import FindingKey, FlowReport, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.core.messages import Exited
 
 NEVER_S = float("inf")
 

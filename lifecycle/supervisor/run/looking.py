@@ -39,7 +39,7 @@ from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
 from lifecycle.supervisor.health.liveliness import not_answering
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.supervisor.shell.grace_period import GracePeriod
+from lifecycle.supervisor.shell.settling import GracePeriod
 from lifecycle.verify.judge import apart_from_numbers, verify, with_findings, with_measured
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome

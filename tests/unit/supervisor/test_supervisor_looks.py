@@ -17,8 +17,8 @@ from lifecycle.measure.delays import Delays
 from lifecycle.measure.sample import Measured, Sample
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.peers import Peers
-from lifecycle.supervisor.shell.grace_period import PASSING_S
 from lifecycle.supervisor.shell.looks import HEALTH_S, Looks, without
+from lifecycle.supervisor.shell.settling import PASSING_S
 from lifecycle.verify.observation import (
     HealthReport,
     NodeParameters,
