@@ -19,8 +19,10 @@ import msgspec
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
+    After,
     Authority,
     Condition,
+    DataLayerSource,
     OnFailure,
     Readiness,
     RunKind,
@@ -747,3 +749,38 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
             node = run.nodes[each.key] = nodes.get(each.key) or Node(planned=each)
             node.planned = each
             node.process = planned.name if started else ""
+    run.early = _configured_before_any_connect(run)
+
+
+_BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
+"""What needs the data layer."""
+
+
+def _configured_before_any_connect(run: Run) -> frozenset[str]:
+    """Return the keys of the managed nodes that no `after:` holds behind a connect.
+
+    None where nothing is negotiated: what a negotiation waits for must not wait for a connection.
+
+    A managed node's start waits for `started` alone and its configure for `configured`, and for
+    what others show, which they may have once they are connected; but the start of a plain node
+    waits for any condition, and a node that depends on it waits with it.
+    """
+    if run.plan.data_layer.source is not DataLayerSource.DYNAMIC:
+        return frozenset()
+    planned = {key: node.planned for key, node in run.nodes.items()}
+    held: set[str] = set()
+
+    def is_held(node: PlannedNode, after: After) -> bool:
+        if held_level(node, after.condition) > Level.CONFIGURED:
+            return False
+        connects = after.node not in planned or planned[after.node].managed
+        beyond = after.condition in _BEYOND or isinstance(after.condition, Readiness)
+        return after.node in held or (connects and beyond)
+
+    while more := {
+        key
+        for key, node in planned.items()
+        if key not in held and any(is_held(node, after) for after in node.after)
+    }:
+        held |= more
+    return frozenset(key for key, node in planned.items() if node.managed and key not in held)

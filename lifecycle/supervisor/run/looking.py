@@ -31,7 +31,7 @@ from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
-from lifecycle.supervisor.connections.negotiation import expected_by_onlooker, is_negotiated
+from lifecycle.supervisor.connections.instructions import expected_by_onlooker, is_negotiated
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes

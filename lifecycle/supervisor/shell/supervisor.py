@@ -22,10 +22,7 @@ from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.authority import (
-    authority_of,
-    configured_before_any_connect,
-)
+from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import check
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
@@ -136,8 +133,6 @@ class Supervisor:
         self.changed = asyncio.Event()
         self.again: set[str] = set()
         self.authority = authority_of(system, means.participant)
-        if self.authority is not None:
-            system.run.early = configured_before_any_connect(system)
         self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
         self._processes = Processes(self)
@@ -391,7 +386,6 @@ class Supervisor:
             self._wake_looks()  # others may be waited for, or for something else
         if self.authority is not None:
             self.authority.replan(run.plan, again)
-            run.early = configured_before_any_connect(self.system)
         self.means.networks.replan(run.plan)
         self.peers.renew()
         if run.first is not first:
