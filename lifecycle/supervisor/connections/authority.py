@@ -249,7 +249,6 @@ class ConnectionAuthority:
         return () if self._negotiated is None else self._negotiated.problems
 
     async def _follow(self) -> None:
-        """Make what is missing at every look."""
         while True:
             self._wake.clear()
             waits_s = [await self._repair(*each) for each in self._lacking()]
@@ -304,7 +303,6 @@ class ConnectionAuthority:
         return _backoff_s(wiring.rounds)
 
     def _say_lost(self, wiring: _Wiring, has: Instructions) -> None:
-        """Say what the node had been given and has no more."""
         there, mapped, name = dict(has.connections), dict(has.mappings), has.node
         for connection, _ in wiring.has.connections:
             if connection in wiring.ours and connection not in there:

@@ -115,11 +115,7 @@ def steps(
     """Return what is missing, in the order in which it is made: make before break.
 
     A connection whose URLs differ cannot be had twice under one name: it alone is broken first.
-
-    Args:
-        wanted: what must be.
-        has: what is.
-        ours: names of connections that this authority made; others are not its to break.
+    `ours`: names of connections that this authority made; others are not its to break.
     """
     step = functools.partial(Command, node=wanted.node)
     connections, mappings = dict(has.connections), dict(has.mappings)
@@ -145,12 +141,7 @@ def steps(
 
 
 def not_wired(subject: str, message: str) -> Finding:
-    """Return the finding that something could not be wired.
-
-    Args:
-        subject: fully qualified node name, or the system's name.
-        message: a whole sentence with the reason.
-    """
+    """Return the finding that a node, or the system, could not be wired."""
     return NOT_WIRED.finding(
         outcome=Outcome.VIOLATED,
         subject=subject,
@@ -329,13 +320,9 @@ class NegotiatedSource:
         return instructions
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Negotiate again for nodes that are started again, and never the TCP ports they had.
+        """Negotiate again for nodes that are started again, new or gone, on other TCP ports.
 
-        Fast DDS would not find them there (see lifecycle.plan.restart).
-
-        Args:
-            plan: as it is now; of another manifest, it has other nodes and flows.
-            names: of the nodes that are started again, of new ones and of those that are gone.
+        Fast DDS would not find them where they were (see lifecycle.plan.restart).
         """
         keys = {self._planned[name].key for name in names if name in self._planned}
         taken = {host: set(ports) for host, ports in self._terms.taken.items()}
@@ -405,7 +392,6 @@ def _with_made(node: PlannedNode, configuration: NodeConfiguration) -> PlannedNo
 
 
 def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
-    """Add the flows of endpoints that were made in code."""
     keys = {each.key for each in plan.nodes}
     there = {(each.topic, each.publisher, each.subscription) for each in plan.flows}
     more = {

@@ -140,7 +140,6 @@ def apply(run: Run, order: Order) -> list[Event]:
 
 
 def _stays_down(process: Process | None) -> bool:
-    """Return whether the run goes on without a process that has failed."""
     return process is not None and process.stays_down and not process.is_over
 
 
@@ -278,14 +277,7 @@ def change_to(run: Run, plan: Plan) -> PlanChange:
 
 
 def changed_nodes(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:
-    """Return a change by the full names of nodes.
-
-    Args:
-        change: from `running` to `plan`.
-        running: what runs, or ran.
-        plan: what it becomes.
-        revision: of the manifest in force.
-    """
+    """Return a change from `running` to `plan` by the full names of nodes."""
     return ChangedNodes(
         differences=difference_lines(change.differences),
         added=tuple(plan.node(key).full_name for key in change.added),

@@ -206,13 +206,7 @@ def _failure(what: Rule, subject: str, message: str, process: Process | None) ->
 
 
 def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
-    """Take one failure of a run that is not ending.
-
-    Args:
-        run: see above.
-        failure: as people read it.
-        end: of its process, if that has ended.
-    """
+    """Take one failure of a run that is not ending; `end`: of its process, if that has ended."""
     process = run.processes.get(failure.process)
     run.changed()
     change = run.change

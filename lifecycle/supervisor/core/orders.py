@@ -82,7 +82,6 @@ def _unfit(run: Run, order: Order) -> str:
 
 
 def _not_restarted(run: Run, name: str) -> str:
-    """Say why a node is none that can be restarted."""
     known = run.nodes.get(name) or run.node_named(name)
     if known is not None:
         return f"cannot restart {known.name!r}: it is attached, no process of this supervisor"
@@ -91,7 +90,6 @@ def _not_restarted(run: Run, name: str) -> str:
 
 
 def _not_entered(run: Run, mode: str) -> str:
-    """Say why a mode cannot be entered; empty if it can."""
     system, modes = run.plan.system, [each.name for each in run.plan.modes]
     if mode not in modes:
         known = f"the modes {', '.join(modes)}" if modes else "no modes"
@@ -195,7 +193,6 @@ def restarted(run: Run, order: Order) -> set[str]:
 
 
 def _restart(run: Run, order: Order) -> None:
-    """Have nodes go down once; failures are forgotten."""
     keys = restarted(run, order)
     names = {run.nodes[key].process for key in keys}
     run.deaths = [each for each in run.deaths if each.process not in names]

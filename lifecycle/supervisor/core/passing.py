@@ -217,7 +217,6 @@ def reached(run: Run, what: str) -> Event:
 
 
 def _withdraw(run: Run) -> list[Event]:
-    """Have those be inactive again that were let through since the gate opened."""
     passage = run.passage
     begun = [] if passage is None else [run.nodes[key] for key in passage.sent & run.nodes.keys()]
     for node in begun:
@@ -266,7 +265,6 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
 
 
 def _became_another(run: Run) -> list[Event]:
-    """What became active is not what was verified."""
     verdict, passage = run.judged.verdict, run.passage
     assert verdict is not None
     assert passage is not None
@@ -334,7 +332,6 @@ def settle_first_contact(run: Run) -> list[Event]:
 
 
 def _restartable(run: Run) -> frozenset[str]:
-    """Return the names of nodes that could be started again on fresh ports before the gate."""
     moving = moving_nodes(run.plan)
     active = {each.process for each in run.nodes.values() if each.level is Level.ACTIVE}
     return frozenset(
@@ -352,14 +349,8 @@ def undiscovered(
 ) -> str | None:
     """Return the full name of the node to start again; None where that would mend nothing.
 
-    Of two ends that do not match either may be the undiscovered one: it is who lacks most,
-    then who was started again least often, then the last by name.
-
-    Args:
-        verdict: that keeps the gate closed.
-        restartable: full names of nodes that get fresh ports when they are started again, and whose
-            process is ours and holds no active node.
-        tries: how often each was started again before.
+    Of two ends that do not match either may be the undiscovered one: it is who lacks most, then who
+    was started again least often, then the last by name.
     """
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if not all(rule(each.rule).if_undiscovered for each in violated):

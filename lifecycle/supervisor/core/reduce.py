@@ -52,10 +52,7 @@ _PASSES = 3
 def take(run: Run, now_s: float, given: messages.Input) -> list[Event]:
     """Apply one input to the state; return what is said of it.
 
-    Args:
-        run: changed in place.
-        now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
-        given: what happened.
+    `now_s` is on the run's clock, which begins at 0 and only goes forward.
     """
     run.now_s, run.wake_s = max(run.now_s, now_s), NEVER_S
     events = _HANDLERS[type(given)](run, given)
@@ -451,7 +448,6 @@ def _hold(run: Run) -> list[Event]:
 
 
 def _measured(run: Run) -> list[Event]:
-    """Say what was measured of each flow of which a number is declared."""
     verdict = run.judged.verdict
     if verdict is None or not verdict.measured:
         return []

@@ -680,11 +680,8 @@ class Run(msgspec.Struct, kw_only=True):
     def whole(self, keys: Iterable[str], *, dependents: bool = False) -> tuple[str, ...]:
         """Return the keys with those of all that comes and goes with these nodes, in plan order.
 
-        A component goes with its container, and a node with all others of its process.
-
-        Args:
-            keys: of the nodes.
-            dependents: those that depend on them go, too.
+        A component goes with its container, a node with all others of its process, and `dependents`
+        with the nodes that they depend on.
         """
         found, more = set[str](), set(keys)
         while more != found:
@@ -710,13 +707,7 @@ class Run(msgspec.Struct, kw_only=True):
 
 
 def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None) -> Run:
-    """Return a run that begins now, with nothing started.
-
-    Args:
-        plan: in its first mode.
-        options: of the person.
-        own: names of the processes that are this supervisor's; None for all.
-    """
+    """Return a run that begins now; `own`: names of the processes it starts, None for all."""
     run = Run(options=options, plan=plan, first=plan, nodes={}, processes={})
     run.mode = plan.modes[0].name if plan.modes else ""
     install(run, plan, own=own)

@@ -202,7 +202,6 @@ class Looks:
         )
 
     async def _quiet(self) -> None:
-        """Let a burst of changes pass."""
         loop = asyncio.get_running_loop()
         until_s = loop.time() + BURST_S
         while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
@@ -211,11 +210,7 @@ class Looks:
     # One verdict
 
     async def judge(self, stage: Stage) -> Verdict:
-        """Look and judge now.
-
-        Args:
-            stage: what the system has reached.
-        """
+        """Look and judge now."""
         if self._stills != (stills := self._standstill.count()):
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
@@ -386,9 +381,7 @@ class Looks:
     def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:
         """Say what is seen of nodes that do not report to us, where that is new.
 
-        Args:
-            seen: by one look.
-            began: the processes when it began: of one that has died since it shows nothing.
+        `began`: the processes when the look began: of one that has died since it shows nothing.
         """
         nodes, awaited = self._system.nodes, self._system.plan.awaited
         seen = without(seen, self._system.dead())

@@ -245,7 +245,6 @@ class Requests:
         return Level.STARTED
 
     def _say_found(self, node: NodeRun, state: str) -> None:
-        """Say, once, how a node was found that others started and that is adopted."""
         if self._system.is_adopted(node) and node.name not in self._found:
             self._found.add(node.name)
             where = (self._system.adopted or {}).get(node.name, "")
@@ -253,7 +252,6 @@ class Requests:
             self._system.emit(Notice(message=text))
 
     async def _load(self, node: NodeRun) -> None:
-        """Have its container load a component, which runs."""
         name = node.planned.run.container
         container = self._system.nodes.get(name)
         full_name = name if container is None else container.name

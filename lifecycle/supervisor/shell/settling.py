@@ -52,15 +52,9 @@ class GracePeriod:
     def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
     ) -> tuple[Verdict, float | None]:
-        """Return the verdict that holds, and after how many seconds it has to be judged again.
+        """Return the verdict that holds, and in how many seconds to judge again, if at all.
 
-        The seconds are None where what was found now holds.
-
-        Args:
-            last: the verdict that holds so far; None before the first.
-            verdict: what was found now.
-            expected: the plan that it was judged against.
-            now_s: on any clock that only goes forward.
+        `last` held so far; None before the first.
         """
         self._note(verdict, expected, now_s)
         before = set() if last is None else {each.key for each in last.findings}

@@ -171,12 +171,7 @@ class Supervisor:
         )
 
     def stop(self, reason: str, exit_code: ExitCode) -> None:
-        """Ask the run to end; once it ends, an interrupt asks it to hurry.
-
-        Args:
-            reason: as text.
-            exit_code: of the run, if this cuts it short.
-        """
+        """Ask the run to end; once it ends, an interrupt asks it to hurry."""
         hurries = exit_code is ExitCode.INTERRUPTED
         self.give(messages.Stop(reason=reason, code=int(exit_code), hurries=hurries))
 
@@ -341,7 +336,6 @@ class Supervisor:
             self.give(messages.Saw(health={node.core.key: node.is_healthy}))
 
     def _silence(self) -> None:
-        """Say which nodes are silent now."""
         liveliness = self.system.liveliness
         hangs = {**liveliness.causes(Cause.HUNG), **liveliness.causes(Cause.STOPPED)}
         known, self._silent = self._silent, dict(liveliness.silent)
@@ -512,7 +506,6 @@ class Supervisor:
         return result
 
     def _end(self, ending: core.Ending) -> None:
-        """Begin to leave, once."""
         if self._last is not None:
             return
         latest = self.system.run.judged.verdict
