@@ -34,6 +34,7 @@ from lifecycle.supervisor.run.events import (
     Notice,
     SystemReached,
 )
+from lifecycle.supervisor.run.options import Until
 
 # Modes
 
@@ -221,7 +222,8 @@ def _take(run: Run, change: Change) -> None:
     run.came = bool(change.touched)
     run.changed()
     keys = change.active if change.back else None
-    run.passage = Passage(until_s=change.until_s, activates=not run.paused, keys=keys)
+    until = Until.VERIFIED if run.paused else Until.ACTIVE
+    run.passage = Passage(until_s=change.until_s, until=until, keys=keys)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:

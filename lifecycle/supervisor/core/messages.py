@@ -157,16 +157,13 @@ class Ordered(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stop(msgspec.Struct, frozen=True, kw_only=True):
-    """The run is to end: `lifecycle down`, a signal.
+    """The run is to end: `lifecycle down`, a signal; `code`: of a run that is cut short by it.
 
-    Attributes:
-        code: of a run that is cut short by it.
-        hurries: said again while the system is taken down, nothing is asked politely any more.
+    After an interrupt while the system is taken down nothing is asked politely any more.
     """
 
     reason: str
-    code: int
-    hurries: bool = False
+    code: ExitCode
 
 
 class Silent(msgspec.Struct, frozen=True, kw_only=True):

@@ -178,7 +178,8 @@ def _begin(run: Run, order: Order) -> list[Event]:
             run.pauses = run.paused
         opens = order.ask is ControlRequest.RESUME or not run.paused
         until_s = run.now_s + run.timeout_s
-        run.passage = Passage(until_s=until_s, activates=opens, judges=opens)
+        until = Until.ACTIVE if opens else Until.CONNECTED
+        run.passage = Passage(until_s=until_s, until=until)
     run.changed()
     return []
 

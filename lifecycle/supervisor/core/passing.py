@@ -17,6 +17,7 @@ from lifecycle.supervisor.core.change import go_back, leave_mode
 from lifecycle.supervisor.core.messages import Programmed
 from lifecycle.supervisor.core.state import Level, Passage, Run
 from lifecycle.supervisor.run.events import Event, Failure, GateOpened, Notice, SystemReached
+from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import not_ok, taken_on_trust
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -52,7 +53,7 @@ def _arrive(run: Run) -> list[Event]:
     if run.change is None:
         passage.until_s = run.now_s + fresh_s
     _is_at_gate(run, passage)
-    if not passage.judges:
+    if passage.until is Until.CONNECTED:
         run.passage = None
     return []
 
@@ -95,7 +96,7 @@ def _open(run: Run, passage: Passage) -> list[Event]:
     if not passage.at_gate or run.judged.mark < passage.mark:
         return []
     if gate.is_open(run):
-        if passage.activates:
+        if passage.until is Until.ACTIVE:
             _begin(run, passage)
         else:
             run.passage = None

@@ -327,8 +327,8 @@ def _given(run: Run, given: messages.Given) -> list[Event]:
 
 def _stop(run: Run, given: messages.Stop) -> list[Event]:
     if run.ending is None:
-        return failure.stop(run, given.reason, ExitCode(given.code))
-    run.hurry = run.hurry or given.hurries
+        return failure.stop(run, given.reason, given.code)
+    run.hurry = run.hurry or given.code is ExitCode.INTERRUPTED
     return []
 
 

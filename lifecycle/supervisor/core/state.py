@@ -155,7 +155,6 @@ class Node(msgspec.Struct, kw_only=True):
     """One node that this supervisor brings up.
 
     Attributes:
-        process: name of its process; empty for one that this supervisor does not start.
         base: how far it was found; it is not taken further down. DOWN for one that we start.
         wired: the authority has connected it as it is to be.
         stuck: a request to it was given up; a further one would wait behind it.
@@ -173,7 +172,6 @@ class Node(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedNode
-    process: str = ""
     level: Level = Level.DOWN
     base: Level = Level.DOWN
     request: Request | None = None
@@ -201,6 +199,11 @@ class Node(msgspec.Struct, kw_only=True):
     def name(self) -> str:
         """Fully qualified node name."""
         return self.planned.full_name
+
+    @property
+    def process(self) -> str:
+        """Name of its process; empty for one that this supervisor does not start."""
+        return "" if self.planned.run.kind is RunKind.ATTACH else self.planned.process
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -333,8 +336,8 @@ class Passage(msgspec.Struct, kw_only=True):
     Attributes:
         until_s: when its time is over; it begins anew when all are at the gate.
         asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
-        judges: the gate is to open; else they are only to come to it.
-        activates: nodes are let through; else the system is only verified.
+        until: CONNECTED: they are only to come to the gate, VERIFIED: it is only judged, ACTIVE: it
+            lets them through.
         keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
@@ -351,8 +354,7 @@ class Passage(msgspec.Struct, kw_only=True):
 
     until_s: float
     asked: bool = True
-    judges: bool = True
-    activates: bool = True
+    until: Until = Until.ACTIVE
     keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
@@ -375,7 +377,8 @@ class Passage(msgspec.Struct, kw_only=True):
 
     def lets_go(self, key: str) -> bool:
         """Return whether a node is to be let through that was kept inactive until now."""
-        return self.asked and self.activates and (self.keys is None or key in self.keys)
+        opens = self.asked and self.until is Until.ACTIVE
+        return opens and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
@@ -713,11 +716,7 @@ def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
     run.adopting = options.adopt
-    run.passage = Passage(
-        until_s=run.timeout_s,
-        judges=options.until is not Until.CONNECTED,
-        activates=options.until is Until.ACTIVE,
-    )
+    run.passage = Passage(until_s=run.timeout_s, until=options.until)
     return run
 
 
@@ -729,8 +728,7 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         if own is not None and planned.name not in own:
             continue
         members = [plan.node(key) for key in planned.nodes]
-        started = planned.run.kind is not RunKind.ATTACH
-        if started:
+        if planned.run.kind is not RunKind.ATTACH:
             supervision = members[0].supervision if members else Supervision()
             process = processes.get(planned.name) or Process(planned=planned, how=supervision)
             process.planned, process.how = planned, supervision
@@ -739,7 +737,6 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         for each in members:
             node = run.nodes[each.key] = nodes.get(each.key) or Node(planned=each)
             node.planned = each
-            node.process = planned.name if started else ""
     run.early = _configured_before_any_connect(run)
 
 

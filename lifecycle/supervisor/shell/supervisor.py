@@ -172,8 +172,7 @@ class Supervisor:
 
     def stop(self, reason: str, exit_code: ExitCode) -> None:
         """Ask the run to end; once it ends, an interrupt asks it to hurry."""
-        hurries = exit_code is ExitCode.INTERRUPTED
-        self.give(messages.Stop(reason=reason, code=int(exit_code), hurries=hurries))
+        self.give(messages.Stop(reason=reason, code=exit_code))
 
     def differences(self, plan: Plan) -> tuple[str, ...]:
         """Say how `plan` differs from what runs, one line each; empty if it does not."""

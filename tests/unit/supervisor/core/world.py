@@ -495,7 +495,7 @@ class World:
 
     def stop(self) -> None:
         messages = self.core.messages
-        self.give(messages.Stop(reason="lifecycle down", code=int(ExitCode.BRING_UP_FAILED)))
+        self.give(messages.Stop(reason="lifecycle down", code=ExitCode.BRING_UP_FAILED))
 
     # Promises
 
