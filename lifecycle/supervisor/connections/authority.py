@@ -1,12 +1,10 @@
 """Reconciles every node's connections and mappings with their desired state: the authority.
 
-Owns: when nodes are wired and how often again, and which nodes are configured before any node is
-connected. What each node must have comes from a `Source` (the plan, or a negotiation), what is
-missing from desired_state.py; requests to a node are driver.py's. Must not import rclpy.
+Owns: when nodes are wired and how often again. What each node must have, and what is missing, is
+instructions.py's; requests to a node are driver.py's. Must not import rclpy.
 
 Everything is level-triggered: each look compares desired with observed state, so that a lost
-connection, a new endpoint and the first wiring are one case. Which nodes are configured first is
-what a negotiation asks before it waits: what it waits for must not in turn wait for a connection.
+connection, a new endpoint and the first wiring are one case.
 """
 
 from __future__ import annotations
@@ -19,18 +17,19 @@ import msgspec
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import ended, set_within, within
-from lifecycle.manifest.model import After, Authority, Condition, DataLayerSource, Readiness
+from lifecycle.manifest.model import Authority
 from lifecycle.node.host.control import Command, Operation
-from lifecycle.plan.model import Plan, PlannedNode
-from lifecycle.supervisor.connections.desired_state import (
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.connections.instructions import (
     Instructions,
+    NegotiatedSource,
+    by_plan,
+    is_negotiated,
     not_wired,
-    planned_instructions,
     steps,
     wired,
 )
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.core.state import Level, held_level
+from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
@@ -44,40 +43,6 @@ from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-
-_BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
-"""What needs the data layer."""
-
-
-def configured_before_any_connect(system: System) -> frozenset[str]:
-    """Return the keys of this supervisor's managed nodes that no `after:` holds behind a connect.
-
-    Nothing where nothing is negotiated.
-
-    A managed node's start waits for `started` alone and its configure for `configured`, and for
-    what others show, which they may have once they are connected; but the start of a plain node
-    waits for any condition, and a node that depends on it waits with it.
-    """
-    if system.plan.data_layer.source is not DataLayerSource.DYNAMIC:
-        return frozenset()
-    planned = {key: node.planned for key, node in system.nodes.items()}
-    held: set[str] = set()
-
-    def is_held(node: PlannedNode, after: After) -> bool:
-        if held_level(node, after.condition) > Level.CONFIGURED:
-            return False
-        connects = after.node not in planned or planned[after.node].managed
-        beyond = after.condition in _BEYOND or isinstance(after.condition, Readiness)
-        return after.node in held or (connects and beyond)
-
-    while more := {
-        key
-        for key, node in planned.items()
-        if key not in held and any(is_held(node, after) for after in node.after)
-    }:
-        held |= more
-    return frozenset(key for key, node in planned.items() if node.managed and key not in held)
-
 
 AGAIN_S = 0.1
 """What was lost is made again at once; the next try comes so long after, then twice as long ..."""
@@ -100,30 +65,8 @@ def authority_of(system: System, participant: ObserverParticipant) -> Connection
     layer = system.plan.data_layer
     if layer.authority is not Authority.SUPERVISOR:
         return None
-    dynamic = layer.source is DataLayerSource.DYNAMIC
-    source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return ConnectionAuthority(system, source, participant)
-
-
-class PlannedSource:
-    """The manifest alone: instructions never change."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.problems: tuple[str, ...] = ()
-        self.replan(plan, ())
-
-    def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Take the plan, for every node."""
-        del names
-        self.expected = plan
-        self._instructions = {
-            each.full_name: planned_instructions(each) for each in plan.nodes if each.managed
-        }
-
-    def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
-        """Return the plan's."""
-        del known
-        return self._instructions
+    negotiated = NegotiatedSource(system.plan) if is_negotiated(system.plan) else None
+    return ConnectionAuthority(system, negotiated, participant)
 
 
 class _Wiring(msgspec.Struct):
@@ -150,18 +93,18 @@ class ConnectionAuthority:
 
     Args:
         system: whose nodes.
-        source: what they must have.
+        negotiated: what they must have, where the manifest alone does not say it.
         participant: reaches nodes that are not declared.
     """
 
     def __init__(
         self,
         system: System,
-        source: PlannedSource | NegotiatedSource,
+        negotiated: NegotiatedSource | None,
         participant: ObserverParticipant,
     ) -> None:
         self._system = system
-        self._source = source
+        self._negotiated = negotiated
         self._participant = participant
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
@@ -172,7 +115,7 @@ class ConnectionAuthority:
         self._closed = False
         layer = system.plan.data_layer
         self._repairs = layer.events
-        self._follows = layer.events or layer.source is DataLayerSource.DYNAMIC
+        self._follows = layer.events or negotiated is not None
 
     async def wire(self, node: NodeRun) -> None:
         """Make everything that a configured node must have before it connects.
@@ -185,8 +128,8 @@ class ConnectionAuthority:
         configuration = await node.driver.interface()
         node.learn(configuration)
         wanted = self._negotiate().get(node.name)
-        if self._source.problems:
-            raise BringUpError("\n".join(self._source.problems))
+        if problems := self._problems():
+            raise BringUpError("\n".join(problems))
         if wanted is None:
             return
         if configuration is None:
@@ -220,7 +163,8 @@ class ConnectionAuthority:
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
-        self._source.replan(plan, names)
+        if self._negotiated is not None:
+            self._negotiated.replan(plan, names)
         for name in names:
             self._wirings.pop(name, None)
         self._instructions = {}
@@ -236,9 +180,9 @@ class ConnectionAuthority:
                 node.configuration = each
         if not self._follows:
             return
-        before = self._source.problems
+        before = self._problems()
         self._negotiate()
-        for problem in self._source.problems:
+        for problem in self._problems():
             if problem not in before:
                 self._system.emit(Notice(message=problem))
         self._wake.set()
@@ -269,7 +213,7 @@ class ConnectionAuthority:
             if wiring.error and wiring.given_up is not None
         ]
         system = self._system.plan.system
-        found += [not_wired(system, each) for each in self._source.problems]
+        found += [not_wired(system, each) for each in self._problems()]
         return tuple(found)
 
     def is_at_work(self) -> bool:
@@ -293,12 +237,17 @@ class ConnectionAuthority:
         for node in self._system.nodes.values():
             if node.configuration is not None:
                 known[node.name] = node.configuration
-        self._instructions = self._source.instructions(known)
-        self._system.expected = self._source.expected
+        if self._negotiated is not None:
+            self._instructions = self._negotiated.instructions(known)
+            self._system.expected = self._negotiated.expected
+        elif not self._instructions:
+            self._instructions = by_plan(self._system.run.plan)
         return self._instructions
 
+    def _problems(self) -> tuple[str, ...]:
+        return () if self._negotiated is None else self._negotiated.problems
+
     async def _follow(self) -> None:
-        """Make what is missing at every look."""
         while True:
             self._wake.clear()
             waits_s = [await self._repair(*each) for each in self._lacking()]
@@ -353,7 +302,6 @@ class ConnectionAuthority:
         return _backoff_s(wiring.rounds)
 
     def _say_lost(self, wiring: _Wiring, has: Instructions) -> None:
-        """Say what the node had been given and has no more."""
         there, mapped, name = dict(has.connections), dict(has.mappings), has.node
         for connection, _ in wiring.has.connections:
             if connection in wiring.ours and connection not in there:

@@ -82,7 +82,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
             if each.name
         ),
         uptime_s=elapsed_s - process.started_s if runs and process is not None else None,
-        restarts=0 if known is None else known.policy.restarts,
+        restarts=0 if known is None else known.restarts,
         last_failure=last,
         next_try_s=due_s if known is not None and known.failed and due_s > 0 else None,
         cpu_s=cpu_s,

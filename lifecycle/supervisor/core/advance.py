@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from lifecycle.manifest.model import After, Condition, Readiness, Restart, RunKind
 from lifecycle.plan.model import HeldBy
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
-from lifecycle.supervisor.core import effects, gate
+from lifecycle.supervisor.core import gate, messages
 from lifecycle.supervisor.core.state import (
     DOWNWARDS,
     HOLDS,
@@ -200,10 +200,10 @@ def stage_of(run: Run) -> Stage:
     return Stage.ACTIVE if passed and not run.paused and _is_whole(run) else Stage.CONNECTED
 
 
-def advance(run: Run) -> list[effects.Effect]:
+def advance(run: Run) -> list[messages.Effect]:
     """Return what is to be done now, and note it in the state."""
-    found: list[effects.Effect] = [
-        effects.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
+    found: list[messages.Effect] = [
+        messages.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
     ]
     run.outbox = []
     if run.adopting and run.ending is None:
@@ -219,7 +219,7 @@ def advance(run: Run) -> list[effects.Effect]:
         if node.request is not None:  # if it is late now, only a tick says so
             run.wakes_at(late_at_s(node.request))
     if run.wake_s < NEVER_S:
-        found.append(effects.Wake(at_s=run.wake_s))
+        found.append(messages.Wake(at_s=run.wake_s))
     return found
 
 
@@ -294,7 +294,7 @@ def _goes_with_container(run: Run, node: Node) -> bool:
     return bool(loaded) and container is not None and wanted(run, container) is Level.DOWN
 
 
-def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
+def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
     appears = step is Step.START and only_appears(node) and not node.planned.holds
     theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
@@ -306,11 +306,11 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
         own_s=OWN_S if theirs else 0.0,
     )
     if step is not Step.ACTIVATE:
-        return effects.Ask(node=node.key, step=step, number=run.requests)
+        return messages.Ask(node=node.key, step=step, number=run.requests)
     assert run.passage is not None
     run.passage.sent.add(node.key)
     node.let_through = True
-    return effects.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
+    return messages.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
 
 
 def late_at_s(request: Request) -> float:
@@ -327,19 +327,19 @@ def is_to_end(run: Run, process: Process) -> bool:
     return not any(wanted(run, each) for each in run.nodes_of(process.name))
 
 
-def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
+def _process(run: Run, process: Process) -> Iterator[messages.Effect]:
     if process.state is ProcessState.EXITED:
         if not process.sweeping:
             process.sweeping = True
-            yield effects.Sweep(process=process.name)
+            yield messages.Sweep(process=process.name)
     elif process.state is None:
         if _may_be_spawned(run, process):
             process.state, process.end = ProcessState.STARTING, None
             process.started(run.now_s)
-            yield effects.Spawn(process=process.name)
+            yield messages.Spawn(process=process.name)
     elif SIGKILL not in process.sent and run.is_past(_barks_at_s(run, process)):
         process.sent = [*process.sent, SIGKILL]
-        yield effects.Signal(process=process.name, number=SIGKILL)
+        yield messages.Signal(process=process.name, number=SIGKILL)
     elif process.pid and is_to_end(run, process):
         yield from _end(run, process)
 
@@ -353,14 +353,14 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
 
 def _barks_at_s(run: Run, process: Process) -> float:
     """Return when the watchdog of a process ends it; NEVER_S while none of its nodes hangs."""
-    how = process.policy.how
+    how = process.how
     if not how.watchdog_sec or how.restart is Restart.NO:
         return NEVER_S
     members = run.nodes_of(process.name)
     return min((each.hangs_s for each in members), default=NEVER_S) + how.watchdog_sec
 
 
-def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
+def _end(run: Run, process: Process) -> Iterator[messages.Signal]:
     """End a process once nothing is left to undo in it, by ever stronger means."""
     members = [*run.nodes_of(process.name)]
     escalation = _escalation(run, process, members)
@@ -380,7 +380,7 @@ def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
     process.asked_until_s = run.now_s + wait_s
     run.wakes_at(process.asked_until_s)
     process.sent = [*process.sent, number]
-    yield effects.Signal(process=process.name, number=number)
+    yield messages.Signal(process=process.name, number=number)
 
 
 def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
@@ -396,7 +396,7 @@ def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
 # The gate, networks, parameters
 
 
-def _parameters(run: Run) -> Iterator[effects.Give]:
+def _parameters(run: Run) -> Iterator[messages.Give]:
     if run.ending is not None or (run.switch is not None and not is_settled_down(run)):
         return
     later = {key: each for key, each in run.to_give.items() if key in run.giving}
@@ -405,7 +405,7 @@ def _parameters(run: Run) -> Iterator[effects.Give]:
             run.giving.add(key)
             if run.change is not None and values is not None:
                 run.change.given[key] = values
-            yield effects.Give(node=key, values=values)
+            yield messages.Give(node=key, values=values)
     run.to_give = later
 
 
@@ -416,7 +416,7 @@ def is_settled_down(run: Run) -> bool:
     )
 
 
-def _gate(run: Run) -> Iterator[effects.Effect]:
+def _gate(run: Run) -> Iterator[messages.Effect]:
     if run.ending is not None:
         return
     judged, passage = run.judged, run.opening
@@ -424,12 +424,12 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
     if programs and gate.is_open(run) and passage and judged.verdict:
         run.requests += 1
         passage.programming, passage.flows = run.requests, judged.verdict.flows
-        yield effects.Program(verdict=judged.verdict, number=run.requests)
+        yield messages.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
     due = not gate.is_latest(run) or run.is_past(judged.again_s)
     if due and not judged.looking and (run.is_watched or is_at_gate(run)):
         judged.looking, judged.again_s = True, NEVER_S
-        yield effects.Look(mark=run.mark)
+        yield messages.Look(mark=run.mark)
 
 
 def phase_of(run: Run) -> str:

@@ -33,6 +33,7 @@ from lifecycle.supervisor.run.events import (
     Notice,
     SystemReached,
 )
+from lifecycle.supervisor.run.options import Until
 
 # Modes
 
@@ -139,7 +140,6 @@ def apply(run: Run, order: Order) -> list[Event]:
 
 
 def _stays_down(process: Process | None) -> bool:
-    """Return whether the run goes on without a process that has failed."""
     return process is not None and process.stays_down and not process.is_over
 
 
@@ -221,7 +221,8 @@ def _take(run: Run, change: Change) -> None:
     run.came = bool(change.touched)
     run.changed()
     keys = change.active if change.back else None
-    run.passage = Passage(until_s=change.until_s, activates=not run.paused, keys=keys)
+    until = Until.VERIFIED if run.paused else Until.ACTIVE
+    run.passage = Passage(until_s=change.until_s, until=until, keys=keys)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:
@@ -277,14 +278,7 @@ def change_to(run: Run, plan: Plan) -> PlanChange:
 
 
 def changed_nodes(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:
-    """Return a change by the full names of nodes.
-
-    Args:
-        change: from `running` to `plan`.
-        running: what runs, or ran.
-        plan: what it becomes.
-        revision: of the manifest in force.
-    """
+    """Return a change from `running` to `plan` by the full names of nodes."""
     return ChangedNodes(
         differences=difference_lines(change.differences),
         added=tuple(plan.node(key).full_name for key in change.added),

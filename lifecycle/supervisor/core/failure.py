@@ -6,18 +6,18 @@ for people, and how a run ends: `end` and the exit code. Pure.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import RunKind
+from lifecycle.manifest.model import Restart, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
 from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, late_at_s, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
-from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import is_restarted
+from lifecycle.supervisor.core.messages import Exited
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -108,7 +108,7 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = f" while {while_}" if while_ else ""
     barks = process.asked < 0 and bool(process.sent)  # nobody else has sent it anything then
     hangs = next((each.hangs for each in members if each.hangs and barks), "")
-    after_s = process.policy.how.watchdog_sec
+    after_s = process.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
     words = f": {given.words}" if given.words else ""
     end = f"{given.text}{_not_run(process, given)}"
@@ -206,13 +206,7 @@ def _failure(what: Rule, subject: str, message: str, process: Process | None) ->
 
 
 def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
-    """Take one failure of a run that is not ending.
-
-    Args:
-        run: see above.
-        failure: as people read it.
-        end: of its process, if that has ended.
-    """
+    """Take one failure of a run that is not ending; `end`: of its process, if that has ended."""
     process = run.processes.get(failure.process)
     run.changed()
     change = run.change
@@ -263,7 +257,7 @@ def _is_of_change(run: Run, change: Change, failure: Failure, end: Exited | None
 def _is_covered(process: Process | None, end: Exited | None) -> bool:
     if process is None or process.stays_down:
         return False
-    return is_restarted(process.policy.how, None if end is None else end.status)
+    return is_restarted(process.how, None if end is None else end.status)
 
 
 def goes_on(failure: Failure) -> Failure:
@@ -290,13 +284,11 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     """Have a process, and what goes down with it, started again later; or give it up."""
     process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
     was_up = run.held_s is not None
-    due_s = process.policy.failed(run.now_s, was_up=was_up)
+    due_s = again_at_s(process, run.now_s, was_up=was_up)
     events: list[Event] = [goes_on(failure)]
     if due_s is None:
         history = tuple(process.failures)
-        events.append(
-            GaveUp(process=process.name, restarts=process.policy.restarts, history=history)
-        )
+        events.append(GaveUp(process=process.name, restarts=process.restarts, history=history))
         run.fails_now(_given_up(process, failure, was_up=was_up))
         return events
     keys = run.group(process.name)
@@ -313,11 +305,48 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
             nodes=tuple(run.nodes[key].name for key in keys),
             reason=failure.message,
             stderr=process.failures[-1].stderr,
-            restarts=process.policy.restarts,
+            restarts=process.restarts,
             in_s=due_s - run.now_s,
         )
     )
     return events
+
+
+def again_at_s(process: Process, now_s: float, *, was_up: bool) -> float | None:
+    """Return when a process that fails now is to be started again; None to give up.
+
+    What the keys mean is systemd.service(5)'s. Until its system `was_up` no start is forgotten: a
+    process that fails late each time must not hold a bring-up for ever.
+    """
+    interval_s = process.how.start_limit_interval_sec
+    if interval_s and process.starts and now_s - process.starts[-1] >= interval_s:
+        process.in_a_row = 0
+    process.in_a_row += 1
+    again_s = now_s + delay_s(process.how, process.in_a_row)
+    if interval_s:
+        if was_up:
+            process.starts = [each for each in process.starts if each > again_s - interval_s]
+        if len(process.starts) >= process.how.start_limit_burst:
+            return None
+    return again_s
+
+
+def is_restarted(how: Supervision, exit_status: int | None) -> bool:
+    """Return whether a process is started again after such an end; None: not an exit by itself."""
+    if how.restart is Restart.ON_FAILURE:
+        return exit_status != 0
+    return how.restart is Restart.ALWAYS
+
+
+def delay_s(how: Supervision, in_a_row: int) -> float:
+    """Return the seconds between a failure, the `in_a_row`th, and the next start."""
+    longest = how.restart_max_delay_sec
+    if longest is None or not how.restart_steps or not how.restart_sec:
+        return how.restart_sec
+    if in_a_row > how.restart_steps:
+        return longest
+    exponent = (in_a_row - 1) / how.restart_steps
+    return how.restart_sec * math.pow(longest / how.restart_sec, exponent)
 
 
 def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
@@ -333,7 +362,7 @@ def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
 
 
 def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
-    how = process.policy.how
+    how = process.how
     burst = how.start_limit_burst
     lines = "; ".join(
         f"at {each.elapsed_s:.1f} s, {each.message}" for each in process.failures[-burst:]
@@ -353,7 +382,7 @@ def end(run: Run, ending: Ending) -> list[Event]:
     """End the run: from now on everything is to be down. Whatever is open is answered."""
     if run.ending is not None:
         return []
-    restarts = [(each.name, each.policy.restarts) for each in run.processes.values()]
+    restarts = [(each.name, each.restarts) for each in run.processes.values()]
     said = [f"{name!r} {n} time{'s' * (n != 1)}" for name, n in restarts if n]
     summary = f"restarted: {', '.join(said)}" if said else ""
     reasons = (ending.reason, summary, gate.passed(run.judged))

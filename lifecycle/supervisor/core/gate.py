@@ -12,7 +12,7 @@ from collections.abc import Collection
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.core.inputs import Verified
+from lifecycle.supervisor.core.messages import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
 from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, with_only
@@ -115,9 +115,7 @@ def lasts_until(run: Run, at_s: float) -> bool:
 def refuses_at_s(run: Run, until_s: float) -> float:
     """Return when the gate has stayed closed for long enough; NEVER_S while it may open.
 
-    Args:
-        run: with a verdict.
-        until_s: when the time of who waits for the gate is over.
+    `until_s`: when the time of who waits for the gate is over.
     """
     judged = run.judged
     if judged.verdict is None or allows(run):
@@ -201,10 +199,7 @@ def of_those_there(run: Run, verdict: Verdict) -> Verdict:
 
 
 def see_violations(run: Run) -> None:
-    """Note what is violated of the nodes that are to be as planned, and what of it counts.
-
-    It is asked at each verdict and at each moment in which something begins to count.
-    """
+    """Note what is violated of the nodes that are to be as planned, and what of it counts."""
     judged = run.judged
     if judged.verdict is None:
         return

@@ -15,14 +15,20 @@ from lifecycle.manifest.model import RunKind
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.restart import restarted
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.core import advance, consequences, failure, gate, inputs, orders, passing
+from lifecycle.supervisor.core import (
+    advance,
+    failure,
+    gate,
+    messages,
+    orders,
+    passing,
+)
 from lifecycle.supervisor.core.change import (
     leave_mode,
     refused_parameters,
     settle_change,
     settle_mode,
 )
-from lifecycle.supervisor.core.first_contact import settle_first_contact
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -43,13 +49,10 @@ _PASSES = 3
 """An order that ends, the next that begins, and the gate that it asks: no more follow silently."""
 
 
-def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
+def take(run: Run, now_s: float, given: messages.Input) -> list[Event]:
     """Apply one input to the state; return what is said of it.
 
-    Args:
-        run: changed in place.
-        now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
-        given: what happened.
+    `now_s` is on the run's clock, which begins at 0 and only goes forward.
     """
     run.now_s, run.wake_s = max(run.now_s, now_s), NEVER_S
     events = _HANDLERS[type(given)](run, given)
@@ -75,9 +78,9 @@ def _settle(run: Run) -> list[Event]:
         events += settle_mode(run)
         events += settle_change(run)
         events += passing.settle(run)
-        events += settle_first_contact(run)
+        events += passing.settle_first_contact(run)
         events += orders.settle_orders(run)
-        events += consequences.settle_consequences(run)
+        events += orders.settle_consequences(run)
         events += failure.say_slow(run)
         events += _hold(run)
     if passage is not None and run.passage is None and was_held:
@@ -88,7 +91,7 @@ def _settle(run: Run) -> list[Event]:
 # Processes
 
 
-def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
+def _spawned(run: Run, given: messages.Spawned) -> list[Event]:
     process = run.processes.get(given.process)
     if process is None or process.state is not ProcessState.STARTING:
         return []
@@ -103,7 +106,7 @@ def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
     return failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
 
 
-def _exited(run: Run, given: inputs.Exited) -> list[Event]:
+def _exited(run: Run, given: messages.Exited) -> list[Event]:
     process = run.processes.get(given.process)
     if process is None or not process.is_alive:
         return []
@@ -129,7 +132,7 @@ def _exited(run: Run, given: inputs.Exited) -> list[Event]:
     return [*forced, *map(failure.goes_on, failures)]
 
 
-def _ends_in_order(run: Run, process: Process, given: inputs.Exited) -> bool:
+def _ends_in_order(run: Run, process: Process, given: messages.Exited) -> bool:
     """Return whether a process that is to end, or was asked to, has not died instead."""
     hosted = process.planned.run.kind is RunKind.PYTHON
     if process.asked < 0:
@@ -148,7 +151,7 @@ def _is_down(node: Node) -> None:
     node.shown = frozenset()
 
 
-def _swept(run: Run, given: inputs.Swept) -> list[Event]:
+def _swept(run: Run, given: messages.Swept) -> list[Event]:
     process = run.processes.get(given.process)
     if process is None or process.state is not ProcessState.EXITED:
         return []
@@ -169,7 +172,7 @@ def _swept(run: Run, given: inputs.Swept) -> list[Event]:
     return []
 
 
-def _silent(run: Run, given: inputs.Silent) -> list[Event]:
+def _silent(run: Run, given: messages.Silent) -> list[Event]:
     node = run.nodes.get(given.node)
     if node is None:
         return []
@@ -183,7 +186,7 @@ def _silent(run: Run, given: inputs.Silent) -> list[Event]:
 # Nodes
 
 
-def _replied(run: Run, given: inputs.Replied) -> list[Event]:
+def _replied(run: Run, given: messages.Replied) -> list[Event]:
     node = run.nodes.get(given.node)
     if node is None or node.request is None or node.request.number != given.number:
         return []  # it was given up
@@ -226,7 +229,7 @@ def _is_there(run: Run, node: Node) -> None:
 
 
 def _step_failed(
-    run: Run, node: Node, step: Step, given: inputs.Replied, goal: Level
+    run: Run, node: Node, step: Step, given: messages.Replied, goal: Level
 ) -> list[Event]:
     node.level = given.level
     is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
@@ -239,7 +242,7 @@ def _step_failed(
     return failure.fail(run, failure.of_step(run, node, what, given.error))
 
 
-def _saw(run: Run, given: inputs.Saw) -> list[Event]:
+def _saw(run: Run, given: messages.Saw) -> list[Event]:
     events: list[Event] = []
     for key, level in given.levels.items():
         node = run.nodes.get(key)
@@ -273,7 +276,7 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
 # Everything else
 
 
-def _tick(run: Run, given: inputs.Tick) -> list[Event]:
+def _tick(run: Run, given: messages.Tick) -> list[Event]:
     for key, waited_s in given.waited_s.items():
         node = run.nodes.get(key)
         if node is not None and node.request is not None:
@@ -286,14 +289,14 @@ def _tick(run: Run, given: inputs.Tick) -> list[Event]:
     return events
 
 
-def _adopted(run: Run, given: inputs.Adopted) -> list[Event]:
+def _adopted(run: Run, given: messages.Adopted) -> list[Event]:
     install(run, given.plan, own=frozenset(each.planned.process for each in run.nodes.values()))
     run.adopting, run.adopted = False, given.nodes
     run.changed()
     return []
 
 
-def _refused(run: Run, given: inputs.Refused) -> list[Event]:
+def _refused(run: Run, given: messages.Refused) -> list[Event]:
     if run.ending is not None:
         return []
     run.judged.verdict = given.verdict
@@ -301,14 +304,14 @@ def _refused(run: Run, given: inputs.Refused) -> list[Event]:
     return [said, *failure.end_refused(run, given.verdict, passing.CLOSED)]
 
 
-def _verified(run: Run, given: inputs.Verified) -> list[Event]:
+def _verified(run: Run, given: messages.Verified) -> list[Event]:
     verdict, stage = gate.take_verdict(run, given), advance.stage_of(run)
     if verdict is None:
         return []
     return [VerdictChanged(stage=stage, verdict=verdict)]
 
 
-def _given(run: Run, given: inputs.Given) -> list[Event]:
+def _given(run: Run, given: messages.Given) -> list[Event]:
     run.changed()
     if given.node not in run.giving:
         return []
@@ -322,14 +325,14 @@ def _given(run: Run, given: inputs.Given) -> list[Event]:
     return []
 
 
-def _stop(run: Run, given: inputs.Stop) -> list[Event]:
+def _stop(run: Run, given: messages.Stop) -> list[Event]:
     if run.ending is None:
-        return failure.stop(run, given.reason, ExitCode(given.code))
-    run.hurry = run.hurry or given.hurries
+        return failure.stop(run, given.reason, given.code)
+    run.hurry = run.hurry or given.code is ExitCode.INTERRUPTED
     return []
 
 
-def _broken(run: Run, given: inputs.Broken) -> list[Event]:
+def _broken(run: Run, given: messages.Broken) -> list[Event]:
     run.broken = run.broken or given.finds
     if run.ending is not None:
         return []
@@ -339,28 +342,28 @@ def _broken(run: Run, given: inputs.Broken) -> list[Event]:
     return []
 
 
-def _changed(run: Run, _: inputs.Changed) -> list[Event]:
+def _changed(run: Run, _: messages.Changed) -> list[Event]:
     run.changed()
     return []
 
 
 _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
-    inputs.Tick: _tick,
-    inputs.Spawned: _spawned,
-    inputs.Exited: _exited,
-    inputs.Swept: _swept,
-    inputs.Replied: _replied,
-    inputs.Saw: _saw,
-    inputs.Changed: _changed,
-    inputs.Verified: _verified,
-    inputs.Programmed: passing.programmed,
-    inputs.Given: _given,
-    inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
-    inputs.Stop: _stop,
-    inputs.Silent: _silent,
-    inputs.Adopted: _adopted,
-    inputs.Refused: _refused,
-    inputs.Broken: _broken,
+    messages.Tick: _tick,
+    messages.Spawned: _spawned,
+    messages.Exited: _exited,
+    messages.Swept: _swept,
+    messages.Replied: _replied,
+    messages.Saw: _saw,
+    messages.Changed: _changed,
+    messages.Verified: _verified,
+    messages.Programmed: passing.programmed,
+    messages.Given: _given,
+    messages.Ordered: lambda run, given: orders.take_order(run, given.order),
+    messages.Stop: _stop,
+    messages.Silent: _silent,
+    messages.Adopted: _adopted,
+    messages.Refused: _refused,
+    messages.Broken: _broken,
 }
 
 
@@ -445,7 +448,6 @@ def _hold(run: Run) -> list[Event]:
 
 
 def _measured(run: Run) -> list[Event]:
-    """Say what was measured of each flow of which a number is declared."""
     verdict = run.judged.verdict
     if verdict is None or not verdict.measured:
         return []
@@ -468,7 +470,7 @@ def _returned(run: Run) -> list[Event]:
                 Restarted(
                     process=process.name,
                     nodes=tuple(each.name for each in members),
-                    restarts=process.policy.restarts,
+                    restarts=process.restarts,
                     took_s=run.now_s - process.away_s,
                 )
             )

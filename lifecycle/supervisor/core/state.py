@@ -13,13 +13,16 @@ from __future__ import annotations
 import enum
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
+    After,
     Authority,
     Condition,
+    DataLayerSource,
     OnFailure,
     Readiness,
     RunKind,
@@ -29,11 +32,12 @@ from lifecycle.manifest.model import (
 from lifecycle.plan.comparison import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
-from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import Until, UpOptions
 from lifecycle.verify.verdict import FindingKey, FlowReport, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.core.messages import Exited
 
 NEVER_S = float("inf")
 
@@ -151,7 +155,6 @@ class Node(msgspec.Struct, kw_only=True):
     """One node that this supervisor brings up.
 
     Attributes:
-        process: name of its process; empty for one that this supervisor does not start.
         base: how far it was found; it is not taken further down. DOWN for one that we start.
         wired: the authority has connected it as it is to be.
         stuck: a request to it was given up; a further one would wait behind it.
@@ -169,7 +172,6 @@ class Node(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedNode
-    process: str = ""
     level: Level = Level.DOWN
     base: Level = Level.DOWN
     request: Request | None = None
@@ -197,6 +199,11 @@ class Node(msgspec.Struct, kw_only=True):
     def name(self) -> str:
         """Fully qualified node name."""
         return self.planned.full_name
+
+    @property
+    def process(self) -> str:
+        """Name of its process; empty for one that this supervisor does not start."""
+        return "" if self.planned.run.kind is RunKind.ATTACH else self.planned.process
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -242,7 +249,10 @@ class Process(msgspec.Struct, kw_only=True):
         end: how it ended; None while it has not.
         log: file with its output; empty before it was started.
         sweeping: what it left is being ended, and forgotten by the graph.
-        policy: when it is started again, over all of its lives.
+        how: it is supervised, as the manifest says.
+        restarts: how often it was started again after a failure.
+        starts: when it was started, by all that its start limit counts.
+        in_a_row: its failures without a long run between them.
         by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
@@ -253,7 +263,7 @@ class Process(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedProcess
-    policy: RestartPolicy
+    how: Supervision
     may_end: bool = False
     state: ProcessState | None = None
     pid: int = 0
@@ -261,6 +271,9 @@ class Process(msgspec.Struct, kw_only=True):
     log: str = ""
     sweeping: bool = False
     by_hand: bool = True
+    restarts: int = 0
+    starts: list[float] = []
+    in_a_row: int = 0
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
@@ -277,9 +290,11 @@ class Process(msgspec.Struct, kw_only=True):
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
         if self.by_hand:
-            self.policy.reset(now_s)
-        else:
-            self.policy.started(now_s, after_failure=self.failed)
+            self.starts, self.in_a_row = [], 0
+        self.restarts += self.failed and not self.by_hand
+        # Without a limit they are not counted, and must not pile up.
+        kept = self.starts if self.how.start_limit_interval_sec else []
+        self.starts = [*kept, now_s]
         self.failed = self.by_hand = False
 
     def restarted_by_hand(self) -> None:
@@ -321,8 +336,8 @@ class Passage(msgspec.Struct, kw_only=True):
     Attributes:
         until_s: when its time is over; it begins anew when all are at the gate.
         asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
-        judges: the gate is to open; else they are only to come to it.
-        activates: nodes are let through; else the system is only verified.
+        until: CONNECTED: they are only to come to the gate, VERIFIED: it is only judged, ACTIVE: it
+            lets them through.
         keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
@@ -339,8 +354,7 @@ class Passage(msgspec.Struct, kw_only=True):
 
     until_s: float
     asked: bool = True
-    judges: bool = True
-    activates: bool = True
+    until: Until = Until.ACTIVE
     keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
@@ -363,7 +377,8 @@ class Passage(msgspec.Struct, kw_only=True):
 
     def lets_go(self, key: str) -> bool:
         """Return whether a node is to be let through that was kept inactive until now."""
-        return self.asked and self.activates and (self.keys is None or key in self.keys)
+        opens = self.asked and self.until is Until.ACTIVE
+        return opens and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
@@ -668,11 +683,8 @@ class Run(msgspec.Struct, kw_only=True):
     def whole(self, keys: Iterable[str], *, dependents: bool = False) -> tuple[str, ...]:
         """Return the keys with those of all that comes and goes with these nodes, in plan order.
 
-        A component goes with its container, and a node with all others of its process.
-
-        Args:
-            keys: of the nodes.
-            dependents: those that depend on them go, too.
+        A component goes with its container, a node with all others of its process, and `dependents`
+        with the nodes that they depend on.
         """
         found, more = set[str](), set(keys)
         while more != found:
@@ -698,23 +710,13 @@ class Run(msgspec.Struct, kw_only=True):
 
 
 def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None) -> Run:
-    """Return a run that begins now, with nothing started.
-
-    Args:
-        plan: in its first mode.
-        options: of the person.
-        own: names of the processes that are this supervisor's; None for all.
-    """
+    """Return a run that begins now; `own`: names of the processes it starts, None for all."""
     run = Run(options=options, plan=plan, first=plan, nodes={}, processes={})
     run.mode = plan.modes[0].name if plan.modes else ""
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
     run.adopting = options.adopt
-    run.passage = Passage(
-        until_s=run.timeout_s,
-        judges=options.until is not Until.CONNECTED,
-        activates=options.until is Until.ACTIVE,
-    )
+    run.passage = Passage(until_s=run.timeout_s, until=options.until)
     return run
 
 
@@ -726,16 +728,47 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         if own is not None and planned.name not in own:
             continue
         members = [plan.node(key) for key in planned.nodes]
-        started = planned.run.kind is not RunKind.ATTACH
-        if started:
+        if planned.run.kind is not RunKind.ATTACH:
             supervision = members[0].supervision if members else Supervision()
-            process = processes.get(planned.name) or Process(
-                planned=planned, policy=RestartPolicy(supervision)
-            )
-            process.planned, process.policy.how = planned, supervision
+            process = processes.get(planned.name) or Process(planned=planned, how=supervision)
+            process.planned, process.how = planned, supervision
             process.may_end = bool(members) and all(each.may_end for each in members)
             run.processes[planned.name] = process
         for each in members:
             node = run.nodes[each.key] = nodes.get(each.key) or Node(planned=each)
             node.planned = each
-            node.process = planned.name if started else ""
+    run.early = _configured_before_any_connect(run)
+
+
+_BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
+"""What needs the data layer."""
+
+
+def _configured_before_any_connect(run: Run) -> frozenset[str]:
+    """Return the keys of the managed nodes that no `after:` holds behind a connect.
+
+    None where nothing is negotiated: what a negotiation waits for must not wait for a connection.
+
+    A managed node's start waits for `started` alone and its configure for `configured`, and for
+    what others show, which they may have once they are connected; but the start of a plain node
+    waits for any condition, and a node that depends on it waits with it.
+    """
+    if run.plan.data_layer.source is not DataLayerSource.DYNAMIC:
+        return frozenset()
+    planned = {key: node.planned for key, node in run.nodes.items()}
+    held: set[str] = set()
+
+    def is_held(node: PlannedNode, after: After) -> bool:
+        if held_level(node, after.condition) > Level.CONFIGURED:
+            return False
+        connects = after.node not in planned or planned[after.node].managed
+        beyond = after.condition in _BEYOND or isinstance(after.condition, Readiness)
+        return after.node in held or (connects and beyond)
+
+    while more := {
+        key
+        for key, node in planned.items()
+        if key not in held and any(is_held(node, after) for after in node.after)
+    }:
+        held |= more
+    return frozenset(key for key, node in planned.items() if node.managed and key not in held)

@@ -31,14 +31,14 @@ from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
-from lifecycle.supervisor.connections.negotiation import expected_by_onlooker, is_negotiated
+from lifecycle.supervisor.connections.instructions import expected_by_onlooker, is_negotiated
 from lifecycle.supervisor.control.protocol import look
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.nodes.liveliness import ANSWER_S, TRIES, not_answering
 from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.supervisor.shell.grace_period import GracePeriod
+from lifecycle.supervisor.shell.settling import GracePeriod
 from lifecycle.verify.judge import apart_from_numbers, verify, with_findings, with_measured
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome

@@ -20,14 +20,13 @@ from lifecycle.measure.sample import SLOT_S, Measured
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.core import advance, effects, gate, inputs
+from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.liveliness import arrivals
 from lifecycle.supervisor.nodes.system import reached
 from lifecycle.supervisor.processes.process import unlimited
-from lifecycle.supervisor.shell.grace_period import GracePeriod
-from lifecycle.supervisor.shell.standstill import Standstill
+from lifecycle.supervisor.shell.settling import GracePeriod, Standstill
 from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation, shown
 from lifecycle.verify.outcome import Outcome
@@ -96,7 +95,7 @@ class Looks:
         self._was_stale = False
         self._again_s = ASK_AGAIN_S
         self._asked: Passage | None = None
-        self._seen_last: inputs.Saw | None = None
+        self._seen_last: messages.Saw | None = None
         self._activated_s: dict[str, float] = {}
         self._standstill = Standstill()
         self._stills = 0
@@ -125,7 +124,7 @@ class Looks:
         if self._again is not None:
             self._again.cancel()
 
-    async def look(self, _: effects.Look) -> None:
+    async def look(self, _: messages.Look) -> None:
         """Look and judge, once a burst of changes is over."""
         run = self._system.run
         loop = asyncio.get_running_loop()
@@ -169,7 +168,7 @@ class Looks:
 
     def _verified(
         self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
-    ) -> inputs.Verified:
+    ) -> messages.Verified:
         run, authority = self._system.run, self._shell.authority
         now_s = asyncio.get_running_loop().time()
         verdict, awaited_s, again_s = found, list[float](), list[float]()
@@ -193,7 +192,7 @@ class Looks:
         if run.change is not None and authority is not None and authority.is_at_work():
             # The authority has still to make what running nodes lack.
             awaited_s.append(ASK_AGAIN_AT_MOST_S)
-        return inputs.Verified(
+        return messages.Verified(
             mark=mark,
             verdict=verdict,
             again_s=min((*awaited_s, *again_s), default=NEVER_S),
@@ -202,7 +201,6 @@ class Looks:
         )
 
     async def _quiet(self) -> None:
-        """Let a burst of changes pass."""
         loop = asyncio.get_running_loop()
         until_s = loop.time() + BURST_S
         while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
@@ -211,11 +209,7 @@ class Looks:
     # One verdict
 
     async def judge(self, stage: Stage) -> Verdict:
-        """Look and judge now.
-
-        Args:
-            stage: what the system has reached.
-        """
+        """Look and judge now."""
         if self._stills != (stills := self._standstill.count()):
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
@@ -386,9 +380,7 @@ class Looks:
     def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:
         """Say what is seen of nodes that do not report to us, where that is new.
 
-        Args:
-            seen: by one look.
-            began: the processes when it began: of one that has died since it shows nothing.
+        `began`: the processes when the look began: of one that has died since it shows nothing.
         """
         nodes, awaited = self._system.nodes, self._system.plan.awaited
         seen = without(seen, self._system.dead())
@@ -412,7 +404,7 @@ class Looks:
             for key, node in nodes.items()
             if key in awaited and node.process is began.get(node.core.process)
         }
-        saw = inputs.Saw(levels=levels, health=health, shown=ready, elsewhere=elsewhere)
+        saw = messages.Saw(levels=levels, health=health, shown=ready, elsewhere=elsewhere)
         if saw != self._seen_last or levels:
             self._seen_last = saw
             self._shell.give(saw)

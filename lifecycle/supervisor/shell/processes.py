@@ -17,7 +17,7 @@ from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.run_directory import FORK_SERVER, start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.tool_filter import PREFIX_DIGITS
@@ -55,7 +55,7 @@ class Processes:
         self._is_recorded = True
         self.releasing: list[asyncio.Task[None]] = []
 
-    def spawn(self, effect: effects.Spawn) -> None:
+    def spawn(self, effect: messages.Spawn) -> None:
         """Start a process."""
         system = self._system
         before = system.processes.get(effect.process)
@@ -90,13 +90,13 @@ class Processes:
         except (BringUpError, OSError) as error:
             text = error.message if isinstance(error, BringUpError) else str(error)
             self._shell.give(
-                inputs.Spawned(process=process.name, log=process.log.shown, error=text)
+                messages.Spawned(process=process.name, log=process.log.shown, error=text)
             )
             await process.release()
             return
         process.ended.add_done_callback(lambda _: self._ended(process))
         self._shell.give(
-            inputs.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
+            messages.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
         )
         self._record()
 
@@ -157,7 +157,7 @@ class Processes:
         self.forget(process.pid, carried)
         self._shell.looks.left(each.resolved for node in carried for each in node.planned.endpoints)
         self._shell.give(
-            inputs.Exited(
+            messages.Exited(
                 process=process.name,
                 status=end.status,
                 signal=end.signal or 0,
@@ -174,7 +174,7 @@ class Processes:
         )
         self.releasing.append(self._shell.start(process.release()))
 
-    def signal(self, effect: effects.Signal) -> None:
+    def signal(self, effect: messages.Signal) -> None:
         """Send a process a signal, or close its channel, by which a host of ours ends."""
         process = self._system.processes.get(effect.process)
         if process is None:
@@ -188,7 +188,7 @@ class Processes:
         if effect.number:
             process.signal(effect.number)
 
-    async def sweep(self, effect: effects.Sweep) -> None:
+    async def sweep(self, effect: messages.Sweep) -> None:
         """End what a process left, and wait until the graph shows none of its nodes any more."""
         system, fork_server = self._system, self._means.fork_server
         process = system.processes[effect.process]
@@ -209,7 +209,7 @@ class Processes:
         names = {each.name for each in system.nodes.values()}
         self._shell.again |= {node.name for node in carried}
         self._shell.give(
-            inputs.Swept(
+            messages.Swept(
                 process=effect.process,
                 reported={
                     each.name: {report.name: report.urls for report in each.connections}

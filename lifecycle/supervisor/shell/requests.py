@@ -20,7 +20,7 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
-from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
 from lifecycle.supervisor.core.state import NEVER_S, REACHES, Level, Request, Step
@@ -72,7 +72,7 @@ class Requests:
         self._noted: dict[str, tuple[int, tuple[float, ...]]] = {}
         self._found: set[str] = set()
 
-    def ask(self, effect: effects.Ask) -> None:
+    def ask(self, effect: messages.Ask) -> None:
         """Ask a node for a step."""
         node = self._system.nodes[effect.node]
         task = self._shell.start(self._carry_out(node, effect))
@@ -88,7 +88,7 @@ class Requests:
             delays_s = tuple(each - late_s for each in node.run_delays_s())
             self._noted[node.core.key] = request.number, delays_s
 
-    def tick(self, at_s: float) -> inputs.Tick:
+    def tick(self, at_s: float) -> messages.Tick:
         """Return a tick with what is known of late requests: time without a CPU does not count."""
         waited_s: dict[str, float] = {}
         where: dict[str, str] = {}
@@ -106,7 +106,7 @@ class Requests:
                 waited_s[key] = delay_s
             else:
                 where[key] = node.where()
-        return inputs.Tick(at_s=at_s, waited_s=waited_s, where=where)
+        return messages.Tick(at_s=at_s, waited_s=waited_s, where=where)
 
     def drop(self) -> None:
         """End what is done for requests that the core has given up."""
@@ -119,8 +119,8 @@ class Requests:
                 if task is not asyncio.current_task():
                     task.cancel()
 
-    async def _carry_out(self, node: NodeRun, effect: effects.Ask) -> None:
-        reply = inputs.Replied(node=effect.node, number=effect.number, level=node.core.level)
+    async def _carry_out(self, node: NodeRun, effect: messages.Ask) -> None:
+        reply = messages.Replied(node=effect.node, number=effect.number, level=node.core.level)
         try:
             reply = replace(reply, **await self._step(node, effect.step))
         except ChangedError:
@@ -227,7 +227,7 @@ class Requests:
                 node.state = UNCONFIGURED
             return Level.STARTED
         await self._appears(node.name)
-        self._shell.give(inputs.Saw(appeared=frozenset({node.core.key})))
+        self._shell.give(messages.Saw(appeared=frozenset({node.core.key})))
         if planned.managed or node.is_to_be_given:
             self._check_alone(node)
         if not planned.managed:
@@ -245,7 +245,6 @@ class Requests:
         return Level.STARTED
 
     def _say_found(self, node: NodeRun, state: str) -> None:
-        """Say, once, how a node was found that others started and that is adopted."""
         if self._system.is_adopted(node) and node.name not in self._found:
             self._found.add(node.name)
             where = (self._system.adopted or {}).get(node.name, "")
@@ -253,7 +252,6 @@ class Requests:
             self._system.emit(Notice(message=text))
 
     async def _load(self, node: NodeRun) -> None:
-        """Have its container load a component, which runs."""
         name = node.planned.run.container
         container = self._system.nodes.get(name)
         full_name = name if container is None else container.name
@@ -277,7 +275,7 @@ class Requests:
         processes = self._means.participant.processes().get(node.name, {})
         if found := ran_before(node, processes, self._means.fork_server.family()):
             verdict = with_findings(NOT_JUDGED, found, self._system.expected.policy)
-            self._shell.give(inputs.Refused(verdict=verdict))
+            self._shell.give(messages.Refused(verdict=verdict))
 
     # Downwards
 
@@ -297,7 +295,7 @@ class Requests:
 
     # Parameters
 
-    async def give(self, effect: effects.Give) -> None:
+    async def give(self, effect: messages.Give) -> None:
         """Set parameters of a running node."""
         node, clients = self._system.nodes[effect.node], self._means.participant.clients
         giving: Awaitable[None]
@@ -315,7 +313,7 @@ class Requests:
             await giving
         except MiddlewareError as refused:
             error = refused.message
-        self._shell.give(inputs.Given(node=effect.node, error=error))
+        self._shell.give(messages.Given(node=effect.node, error=error))
 
     async def _give_what_is_missing(self, node: NodeRun) -> None:
         """Set parameters where no command line can; what it has not yet, it may have later."""

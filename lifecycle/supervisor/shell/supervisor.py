@@ -23,16 +23,13 @@ from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.authority import (
-    authority_of,
-    configured_before_any_connect,
-)
+from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check
 from lifecycle.supervisor.control.status import process_state, system_status
-from lifecycle.supervisor.core import advance, effects, gate, inputs
+from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import STARTS, refused_at_once
@@ -111,7 +108,7 @@ class Supervisor:
         self.means = means
         self._emit = system.emit
         self._loop = asyncio.get_running_loop()
-        self._inbox: deque[inputs.Input] = deque()
+        self._inbox: deque[messages.Input] = deque()
         self._is_taking = False
         self._touched = False
         self._graph_changes = means.participant.graph.changes
@@ -132,8 +129,6 @@ class Supervisor:
         self.changed = asyncio.Event()
         self.again: set[str] = set()
         self.authority = authority_of(system, means.participant)
-        if self.authority is not None:
-            system.run.early = configured_before_any_connect(system)
         self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
         self._processes = Processes(self)
@@ -142,15 +137,15 @@ class Supervisor:
         self._ros_interface = RosInterface(self)
         self._server = ControlServer(means.directory.socket_path, self)
         self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
-            effects.Ask: self._requests.ask,
-            effects.Give: self._requests.give,
-            effects.Spawn: self._processes.spawn,
-            effects.Signal: self._processes.signal,
-            effects.Sweep: self._processes.sweep,
-            effects.Look: self.looks.look,
-            effects.Program: self._program,
-            effects.Answer: self._answer,
-            effects.Wake: self._wake_at,
+            messages.Ask: self._requests.ask,
+            messages.Give: self._requests.give,
+            messages.Spawn: self._processes.spawn,
+            messages.Signal: self._processes.signal,
+            messages.Sweep: self._processes.sweep,
+            messages.Look: self.looks.look,
+            messages.Program: self._program,
+            messages.Answer: self._answer,
+            messages.Wake: self._wake_at,
         }
         system.on_change = self._touch
         system.on_health = self._health
@@ -172,14 +167,8 @@ class Supervisor:
         )
 
     def stop(self, reason: str, exit_code: ExitCode) -> None:
-        """Ask the run to end; once it ends, an interrupt asks it to hurry.
-
-        Args:
-            reason: as text.
-            exit_code: of the run, if this cuts it short.
-        """
-        hurries = exit_code is ExitCode.INTERRUPTED
-        self.give(inputs.Stop(reason=reason, code=int(exit_code), hurries=hurries))
+        """Ask the run to end; once it ends, an interrupt asks it to hurry."""
+        self.give(messages.Stop(reason=reason, code=exit_code))
 
     def differences(self, plan: Plan) -> tuple[str, ...]:
         """Say how `plan` differs from what runs, one line each; empty if it does not."""
@@ -209,7 +198,7 @@ class Supervisor:
                 return Answer(exit_code=ExitCode.BRING_UP_FAILED, error=text)
         order = replace(order, id=len(self._answers))
         answer = self._answers[order.id] = self._loop.create_future()
-        self.give(inputs.Ordered(order=order))
+        self.give(messages.Ordered(order=order))
         done: Answer = await asyncio.shield(answer)
         if change is not None and done.exit_code == ExitCode.OK:
             return replace(done, change=replace(change, revision=run.revision))
@@ -221,7 +210,7 @@ class Supervisor:
         """Return the run's time, in seconds."""
         return self._emit.elapsed_s
 
-    def give(self, given: inputs.Input) -> None:
+    def give(self, given: messages.Input) -> None:
         """Take an input; one that comes while another is taken is taken after it."""
         self._inbox.append(given)
         if self._is_taking:
@@ -236,14 +225,14 @@ class Supervisor:
         finally:
             self._is_taking = False
 
-    def _take(self, given: inputs.Input) -> None:
+    def _take(self, given: messages.Input) -> None:
         run = self.system.run
         events = take(run, self.now_s(), given)
         self.system.follow()
         self._say_states()
         for event in events:
             self._emit(event)
-        if isinstance(given, inputs.Verified) and given.verdict.measured:
+        if isinstance(given, messages.Verified) and given.verdict.measured:
             self._server.changed()  # other numbers alone are no event
         self._requests.drop()
         wanted = advance.advance(run)
@@ -261,14 +250,14 @@ class Supervisor:
             if run.is_over:
                 self._over.set()
         elif self.system.remote and (left := self.peers.left()) != run.left:
-            self.give(inputs.Saw(left=left))
+            self.give(messages.Saw(left=left))
 
-    def _answer(self, effect: effects.Answer) -> None:
+    def _answer(self, effect: messages.Answer) -> None:
         answer = self._answers[effect.order]
         if not answer.done():
             answer.set_result(Answer(exit_code=effect.code, error=effect.error))
 
-    def _wake_at(self, effect: effects.Wake) -> None:
+    def _wake_at(self, effect: messages.Wake) -> None:
         if self._turns:
             return  # a tick is about to come, and says when the next one is due
         if self._wake is not None:
@@ -319,7 +308,7 @@ class Supervisor:
         graph = self.means.participant.graph
         if self._touched or graph.changes != self._graph_changes or self.looks.is_behind:
             self._touched, self._graph_changes = False, graph.changes
-            self.give(inputs.Changed())
+            self.give(messages.Changed())
             self._wake_looks()
 
     def _wake_looks(self) -> None:
@@ -339,10 +328,9 @@ class Supervisor:
 
     def _health(self, node: NodeRun) -> None:
         if node.core.healthy != node.is_healthy:
-            self.give(inputs.Saw(health={node.core.key: node.is_healthy}))
+            self.give(messages.Saw(health={node.core.key: node.is_healthy}))
 
     def _silence(self) -> None:
-        """Say which nodes are silent now."""
         liveliness = self.system.liveliness
         hangs = {**liveliness.causes(Cause.HUNG), **liveliness.causes(Cause.STOPPED)}
         known, self._silent = self._silent, dict(liveliness.silent)
@@ -350,7 +338,7 @@ class Supervisor:
             node, why = self.system.node_named(name), self._silent.get(name, "")
             if node is not None and why != known.get(name, ""):
                 away, hung = liveliness.is_out_of_reach(name), name in hangs
-                self.give(inputs.Silent(node=node.core.key, why=why, away=away, hangs=hung))
+                self.give(messages.Silent(node=node.core.key, why=why, away=away, hangs=hung))
 
     async def is_seen(self, name: str) -> bool:
         """Return whether discovery shows a node of this name."""
@@ -387,7 +375,6 @@ class Supervisor:
             self._wake_looks()  # others may be waited for, or for something else
         if self.authority is not None:
             self.authority.replan(run.plan, again)
-            run.early = configured_before_any_connect(self.system)
         self.means.networks.replan(run.plan)
         self.peers.renew()
         if run.first is not first:
@@ -413,12 +400,12 @@ class Supervisor:
 
     # What is done
 
-    def _program(self, effect: effects.Program) -> None:
+    def _program(self, effect: messages.Program) -> None:
         if self._programming is not None:
             self._programming.cancel()  # for a passage that was given up
         self._programming = self.start(self._programmed(effect))
 
-    async def _programmed(self, effect: effects.Program) -> None:
+    async def _programmed(self, effect: messages.Program) -> None:
         passage = self.system.run.passage
         until_s = self.now_s() if passage is None else passage.until_s
         error = ""
@@ -427,31 +414,31 @@ class Supervisor:
             await self.means.networks.begin(effect.verdict, left_s)
         except BringUpError as failed:
             error = failed.message
-        self.give(inputs.Programmed(number=effect.number, error=error))
+        self.give(messages.Programmed(number=effect.number, error=error))
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started."""
         try:
             plan, findings = await adopt(self.system, self.means.participant)
         except StepFailedError as failed:
-            self.give(inputs.Broken(failure=failed.failure))
+            self.give(messages.Broken(failure=failed.failure))
             return
         if findings:
             verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
-            self.give(inputs.Refused(verdict=verdict))
+            self.give(messages.Refused(verdict=verdict))
         else:
-            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
+            self.give(messages.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
 
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
         text = f"cannot go on: {text}"
         failed = Failure(rule=PROCESS_DIED.id, subject="fork server", message=text)
-        self.give(inputs.Broken(failure=failed))
+        self.give(messages.Broken(failure=failed))
 
     async def _watch_discovery_server(self) -> None:
         if (server := self.system.server) is not None:
             found = discovery_server.death(server, await asyncio.shield(server.ended))
-            self.give(inputs.Broken(failure=found, finds=True))
+            self.give(messages.Broken(failure=found, finds=True))
 
     # From begin to end
 
@@ -484,7 +471,7 @@ class Supervisor:
             with self._signals():
                 if self.system.run.adopting:
                     self.start(self._adopt())
-                self.give(inputs.Tick())
+                self.give(messages.Tick())
                 try:
                     await self._over.wait()
                 except BaseException:
@@ -514,7 +501,6 @@ class Supervisor:
         return result
 
     def _end(self, ending: core.Ending) -> None:
-        """Begin to leave, once."""
         if self._last is not None:
             return
         latest = self.system.run.judged.verdict

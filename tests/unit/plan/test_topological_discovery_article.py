@@ -37,8 +37,13 @@ from lifecycle.plan.parties import (
     terms_of,
     wishes_of,
 )
-from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions, steps
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
+from lifecycle.supervisor.connections.instructions import (
+    Instructions,
+    NegotiatedSource,
+    party_of,
+    planned_instructions,
+    steps,
+)
 from lifecycle.verify.observation import Identity, NodeConfiguration
 from tests.builders import (
     at,

@@ -19,7 +19,7 @@ from lifecycle.plan.model import (
     PlannedParticipant,
 )
 from lifecycle.plan.parties import Party
-from lifecycle.supervisor.connections.negotiation import party_of
+from lifecycle.supervisor.connections.instructions import party_of
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration, need, node, planned, publisher, reported, subscription

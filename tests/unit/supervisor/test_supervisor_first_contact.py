@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.supervisor.core.first_contact import undiscovered
+from lifecycle.supervisor.core.passing import undiscovered
 from lifecycle.verify.outcome import Outcome
 from tests.unit.supervisor.fakes import verdict
 

@@ -16,8 +16,8 @@ from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Delays, Measured, Sample
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.peers import Peers
-from lifecycle.supervisor.shell.grace_period import PASSING_S
 from lifecycle.supervisor.shell.looks import HEALTH_S, Looks, without
+from lifecycle.supervisor.shell.settling import PASSING_S
 from lifecycle.verify.observation import (
     HealthReport,
     NodeParameters,

@@ -16,8 +16,12 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.connections.desired_state import steps, wired
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource, expected_by_onlooker
+from lifecycle.supervisor.connections.instructions import (
+    NegotiatedSource,
+    expected_by_onlooker,
+    steps,
+    wired,
+)
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
 from tests.builders import at, configuration, need, node, planned, publisher, reported, subscription
 from tests.unit.supervisor.fakes import rewired

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
-from lifecycle.supervisor.shell.grace_period import PASSING_S, GracePeriod
+from lifecycle.supervisor.shell.settling import PASSING_S, GracePeriod
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage, Verdict

@@ -24,13 +24,11 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.supervisor.connections.authority import (
-    TRIES,
-    ConnectionAuthority,
-    PlannedSource,
-)
-from lifecycle.supervisor.connections.desired_state import (
+from lifecycle.supervisor.connections.authority import TRIES, ConnectionAuthority
+from lifecycle.supervisor.connections.instructions import (
     Instructions,
+    NegotiatedSource,
+    by_plan,
     steps,
     wired,
 )
@@ -69,17 +67,15 @@ def wired_plan(*nodes: PlannedNode, **layer: object) -> Plan:
     )
 
 
-class ChangingSource(PlannedSource):
+class ChangingSource(NegotiatedSource):
     """Instructions that a test changes, as a negotiation would."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan)
-        self.now = dict(super().instructions({}))
-        self.known: list[frozenset[str]] = []
+        self.now = dict(by_plan(plan))
         self.next: tuple[str, ...] = ()
 
     def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
-        self.known.append(frozenset(known))
         self.problems = self.next
         return self.now
 
@@ -96,7 +92,7 @@ class Wiring(SessionWorld):
             )
 
         def prepare() -> None:
-            self.authority._source = self.source  # type: ignore[assignment]
+            self.authority._negotiated = self.source
 
         self.prepare = prepare
 

@@ -13,7 +13,7 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, Restart, Supervision
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import advance, phase_of
 from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.core.reduce import take
@@ -65,7 +65,7 @@ class Play:
         self.wake_s = float("inf")
         self.now_s = 0.0
         self.held: list[Any] = []
-        self.give(inputs.Tick())
+        self.give(messages.Tick())
 
     def give(self, given: Any) -> list[str]:
         """Have something happen; return what is asked until all is quiet."""
@@ -96,29 +96,31 @@ class Play:
         found: list[str] = []
         while self.wake_s <= until_s:
             self.now_s = self.wake_s
-            found += self.give(inputs.Tick())
+            found += self.give(messages.Tick())
         self.now_s = until_s
-        return [*found, *self.give(inputs.Tick())]
+        return [*found, *self.give(messages.Tick())]
 
     def order(self, ask: ControlRequest, **what: Any) -> list[str]:
         """Order something; its number is that of the orders before it."""
         number = len(self.answers) + len(self.run.orders) + (self.run.order is not None)
-        return self.give(inputs.Ordered(order=Order(**{"id": number, "ask": ask, **what})))
+        return self.give(messages.Ordered(order=Order(**{"id": number, "ask": ask, **what})))
 
     def down(self) -> list[str]:
         return self.stop("lifecycle down", ExitCode.BRING_UP_FAILED)
 
     def stop(self, reason: str, code: ExitCode) -> list[str]:
-        return self.give(inputs.Stop(reason=reason, code=code))
+        return self.give(messages.Stop(reason=reason, code=code))
 
     def die(self, process: str, status: int | None = None) -> list[str]:
         number = 11 if status is None else 0
-        return self.give(inputs.Exited(process=process, status=status, signal=number, text="gone"))
+        return self.give(
+            messages.Exited(process=process, status=status, signal=number, text="gone")
+        )
 
     def see(self, *found: tuple[str, str]) -> list[str]:
         """Have the next looks find this."""
         self.found = verdict(*found)
-        return self.give(inputs.Changed())
+        return self.give(messages.Changed())
 
     def heard(self, kind: type[E]) -> list[E]:
         """Events of one kind."""
@@ -155,9 +157,9 @@ class Play:
         self.wake_s = float("inf")
         todo = []
         for each in advance(self.run):
-            if isinstance(each, effects.Wake):
+            if isinstance(each, messages.Wake):
                 self.wake_s = each.at_s
-            elif isinstance(each, effects.Answer):
+            elif isinstance(each, messages.Answer):
                 self.answers[each.order] = (each.code, each.error)
             else:
                 self.asked.append(_words(each))
@@ -170,22 +172,22 @@ class Play:
         if way == "hang":
             self.held.append(effect)
             return None
-        if isinstance(effect, effects.Ask):
+        if isinstance(effect, messages.Ask):
             node = self.run.nodes.get(effect.node)
             if node is None:  # it went while it was asked
-                return inputs.Changed()
+                return messages.Changed()
             if way == "die":
-                return inputs.Exited(process=node.process, signal=11, text="gone")
+                return messages.Exited(process=node.process, signal=11, text="gone")
             level = node.level if way else REACHES[effect.step]
             if not node.planned.managed and effect.step is Step.DEACTIVATE:
                 level = Level.STARTED
             changed, error = way == "changed", "" if way == "changed" else way
-            return inputs.Replied(
+            return messages.Replied(
                 node=effect.node, number=effect.number, level=level, error=error, changed=changed
             )
-        if isinstance(effect, effects.Signal):
+        if isinstance(effect, messages.Signal):
             number = effect.number
-            return inputs.Exited(
+            return messages.Exited(
                 process=effect.process,
                 status=None if number else 0,
                 signal=number,
@@ -193,22 +195,22 @@ class Play:
                 clean=number != 9,
             )
         return {
-            effects.Spawn: lambda: inputs.Spawned(process=effect.process, pid=1, error=way),
-            effects.Sweep: lambda: inputs.Swept(process=effect.process),
-            effects.Look: lambda: inputs.Verified(mark=effect.mark, verdict=self.found),
-            effects.Program: lambda: inputs.Programmed(number=effect.number, error=way),
-            effects.Give: lambda: inputs.Given(node=effect.node, error=way),
+            messages.Spawn: lambda: messages.Spawned(process=effect.process, pid=1, error=way),
+            messages.Sweep: lambda: messages.Swept(process=effect.process),
+            messages.Look: lambda: messages.Verified(mark=effect.mark, verdict=self.found),
+            messages.Program: lambda: messages.Programmed(number=effect.number, error=way),
+            messages.Give: lambda: messages.Given(node=effect.node, error=way),
         }[type(effect)]()
 
 
 def _words(effect: Any) -> str:
     name = type(effect).__name__.lower()
-    if isinstance(effect, effects.Ask):
+    if isinstance(effect, messages.Ask):
         return f"{effect.node} {effect.step.value}"
-    if isinstance(effect, effects.Signal):
+    if isinstance(effect, messages.Signal):
         return f"signal {effect.process} {effect.number}"
-    if isinstance(effect, effects.Spawn | effects.Sweep):
+    if isinstance(effect, messages.Spawn | messages.Sweep):
         return f"{name} {effect.process}"
-    if isinstance(effect, effects.Give):
+    if isinstance(effect, messages.Give):
         return f"give {effect.node}{'' if effect.values is None else f' {effect.values.now}'}"
     return name

@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core.consequences import reaction_of
+from lifecycle.supervisor.core.orders import reaction_of
 from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
     ManifestApplied,

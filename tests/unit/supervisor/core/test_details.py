@@ -18,7 +18,7 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.failure import ALSO_S
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.run.events import (
@@ -49,7 +49,7 @@ def test_what_was_measured_is_said_once_when_it_is_decided() -> None:
     decides = measured("ok", random.Random(1))
     silent = replace(decides, topic="/other", bounds=())
     play.found = replace(play.found, measured=(decides, silent))
-    play.give(inputs.Changed())
+    play.give(messages.Changed())
     play.events.clear()
     play.run.decided_s = None
     play.wait(20.0)
@@ -61,10 +61,10 @@ def test_what_was_measured_is_said_once_when_it_is_decided() -> None:
 def test_a_gate_is_judged_by_a_look_that_began_when_all_were_at_it() -> None:
     """A look that began before saw a system that was not whole."""
     play = Play(CHAIN, ways={"camera connect": "hang", "look": "hang"})
-    held = [each for each in play.held if isinstance(each, effects.Look)]
+    held = [each for each in play.held if isinstance(each, messages.Look)]
     play.finish("camera connect")
     for look in held:
-        play.give(inputs.Verified(mark=look.mark, verdict=play.found))
+        play.give(messages.Verified(mark=look.mark, verdict=play.found))
     assert play.heard(GateOpened) == []
 
 
@@ -73,7 +73,7 @@ def test_a_node_that_failed_may_end_with_one_and_no_more_when_it_is_told_to_end(
     for status, says in ((0, False), (1, False), (2, True)):
         play = Play(plan_of(planned_node("a")), ways={"signal a 0": "hang"})
         play.down()
-        play.give(inputs.Exited(process="a", status=status, text="gone"))
+        play.give(messages.Exited(process="a", status=status, text="gone"))
         assert bool(play.run.deaths) == says, status
 
 
@@ -91,10 +91,10 @@ def test_what_a_node_shows_is_a_change_of_the_system() -> None:
     play = Play(CHAIN)
     mark = play.run.mark
     play.ways["look"] = "hang"
-    play.give(inputs.Saw(shown={"camera": frozenset({"publishes image"})}))
+    play.give(messages.Saw(shown={"camera": frozenset({"publishes image"})}))
     assert play.run.mark > mark
     mark = play.run.mark
-    play.give(inputs.Saw(shown={"camera": frozenset({"publishes image"})}))
+    play.give(messages.Saw(shown={"camera": frozenset({"publishes image"})}))
     assert play.run.mark == mark
 
 
@@ -104,7 +104,7 @@ def test_a_node_that_others_activate_is_deactivated_and_after_three_times_left(t
     play.order(ControlRequest.PAUSE)
     assert play.levels == str(int(Level.CONNECTED))
     for _ in range(times):
-        play.give(inputs.Saw(levels={"arm": Level.ACTIVE}))
+        play.give(messages.Saw(levels={"arm": Level.ACTIVE}))
     assert play.story.count("arm deactivate") == 1 + min(times, 3)
 
 
@@ -140,7 +140,7 @@ def test_who_is_at_the_gate_while_the_run_fails_is_not_let_through() -> None:
     play = Play(plan_of(planned_node("a"), planned_node("b")), ways={"look": "hang"})
     play.die("a")
     play.held.pop()
-    play.give(inputs.Verified(mark=play.run.mark, verdict=play.found))
+    play.give(messages.Verified(mark=play.run.mark, verdict=play.found))
     play.wait(ALSO_S)
     assert play.run.ending is not None
     assert "b activate" not in play.story
@@ -191,7 +191,7 @@ def test_how_often_others_activated_a_node_is_forgotten_once_it_passed_the_gate(
     for _ in range(2):
         play.order(ControlRequest.PAUSE)
         for _ in range(3):
-            play.give(inputs.Saw(levels={"arm": Level.ACTIVE}))
+            play.give(messages.Saw(levels={"arm": Level.ACTIVE}))
             assert play.levels == str(int(Level.CONNECTED))
         play.order(ControlRequest.RESUME)
     assert [code for code, _ in play.answers.values()] == [ExitCode.OK] * 4
@@ -203,7 +203,7 @@ def test_a_number_is_measured_for_ten_seconds_also_where_no_look_ends() -> None:
     play = Play(plan_of(replace(planned_node("a"), endpoints=(data,))), ways={"a activate": "hang"})
     play.ways["look"] = "hang"
     play.finish("a activate")
-    play.give(inputs.Verified(mark=play.held.pop().mark, verdict=play.found))
+    play.give(messages.Verified(mark=play.held.pop().mark, verdict=play.found))
     phases = []
     for _ in range(12):
         play.wait(1.0)

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, Discovery, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.failure import ALSO_S
 from lifecycle.supervisor.run.events import Failure, Notice
 from tests.builders import plan_of, planned_node
@@ -47,7 +47,7 @@ def test_a_node_waits_until_another_is_healthy() -> None:
     plan = plan_of(planned_node("a"), planned_node("b", after={"a": Condition.HEALTHY}))
     play = Play(plan)
     assert play.levels == "4 3"
-    play.give(inputs.Saw(health={"a": True}))
+    play.give(messages.Saw(health={"a": True}))
     assert play.levels == "4 4"
 
 
@@ -79,7 +79,7 @@ def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_m
     play = Play(plan_of(node), ways={"driver start": "hang"})
     play.wait(1.0)
     assert play.heard(Notice) == []
-    play.give(inputs.Saw(appeared=frozenset({"driver"})))
+    play.give(messages.Saw(appeared=frozenset({"driver"})))
     play.wait(1.1)
     waits = "waiting for its lifecycle services"
     mends = "if it is a plain node, write 'managed: false' at nodes.driver"
@@ -143,7 +143,7 @@ def test_processes_that_die_one_after_the_other_are_all_named() -> None:
 def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other() -> None:
     play = Play(plan_of(*(planned_node(key, process="all") for key in "abc")), {"a start": "hang"})
     reports = (("/b", "no module 'driver'"), ("/c", "cannot import 'm:C'"))
-    play.give(inputs.Exited(process="all", status=1, text="gone", reports=reports))
+    play.give(messages.Exited(process="all", status=1, text="gone", reports=reports))
     assert play.failures == [
         ("/b", "cannot start '/b': no module 'driver'"),
         ("/c", "cannot import 'm:C'"),
@@ -308,6 +308,6 @@ def test_an_interrupt_and_what_cuts_a_run_short_that_is_bound_to_stay_are_no_suc
     play.stop("interrupted", ExitCode.INTERRUPTED)
     assert (play.code, play.reason) == (130, "interrupted")
     play = Play(CHAIN, stop_after_s=10.0)
-    play.give(inputs.Stop(reason="terminated", code=ExitCode.TERMINATED))
+    play.give(messages.Stop(reason="terminated", code=ExitCode.TERMINATED))
     why = "terminated; it did not hold for the 10 s of --stop-after"
     assert (play.code, play.reason) == (143, why)

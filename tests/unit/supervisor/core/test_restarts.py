@@ -7,8 +7,8 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core.restart import RestartPolicy, delay_s, is_restarted
-from lifecycle.supervisor.core.state import new_run
+from lifecycle.supervisor.core.failure import again_at_s, delay_s, is_restarted
+from lifecycle.supervisor.core.state import Process, new_run
 from lifecycle.supervisor.run.events import (
     GateOpened,
     GaveUp,
@@ -25,10 +25,15 @@ from tests.unit.supervisor.core.playbook import AGAIN, GONE, INTRUDER, Play, cha
 # The policy
 
 
-def _started(how: Supervision) -> RestartPolicy:
-    policy = RestartPolicy(how)
-    policy.reset(0.0)
-    return policy
+def _started(how: Supervision) -> Process:
+    process = Process(planned=plan_of(planned_node("camera")).processes[0], how=how)
+    process.started(0.0)
+    return process
+
+
+def _starts_again(process: Process, now_s: float) -> None:
+    process.failed = True
+    process.started(now_s)
 
 
 def test_the_delay_grows_by_one_factor_up_to_its_longest_and_stays() -> None:
@@ -53,27 +58,27 @@ def test_which_ends_are_started_again_after(
 
 
 def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval() -> None:
-    policy = _started(Supervision(restart=Restart.ALWAYS))
+    process = _started(Supervision(restart=Restart.ALWAYS))
     found = []
     for at_s in (0.1, 0.3, 0.5, 0.7, 0.9):
-        found.append(policy.failed(at_s))
-        policy.started(at_s + 0.1)
+        found.append(again_at_s(process, at_s, was_up=True))
+        _starts_again(process, at_s + 0.1)
     assert found == [pytest.approx(at_s + 0.1) for at_s in (0.1, 0.3, 0.5, 0.7)] + [None]
-    assert policy.restarts == 5
+    assert process.restarts == 5
     endless = _started(Supervision(restart=Restart.ALWAYS, start_limit_interval_sec=0.0))
     for at_s in range(100):
-        assert endless.failed(float(at_s)) == at_s + 0.1
-        endless.started(at_s + 0.1)
+        assert again_at_s(endless, float(at_s), was_up=True) == at_s + 0.1
+        _starts_again(endless, at_s + 0.1)
 
 
 def test_until_the_system_was_up_a_process_that_fails_late_each_time_is_given_up() -> None:
     how = Supervision(restart=Restart.ON_FAILURE, start_limit_interval_sec=1.0, start_limit_burst=3)
-    policies = {was_up: _started(how) for was_up in (True, False)}
-    again = {was_up: [] for was_up in policies}
+    processes = {was_up: _started(how) for was_up in (True, False)}
+    again = {was_up: [] for was_up in processes}
     for now_s in (5.0, 10.0, 15.0):
-        for was_up, policy in policies.items():
-            again[was_up].append(policy.failed(now_s, was_up=was_up) is not None)
-            policy.started(now_s)
+        for was_up, process in processes.items():
+            again[was_up].append(again_at_s(process, now_s, was_up=was_up) is not None)
+            _starts_again(process, now_s)
     assert again == {True: [True, True, True], False: [True, True, False]}
 
 
@@ -81,12 +86,13 @@ def test_after_a_long_run_and_after_a_person_the_delay_begins_anew() -> None:
     how = Supervision(
         restart=Restart.ALWAYS, restart_sec=1.0, restart_steps=2, restart_max_delay_sec=4.0
     )
-    policy = _started(how)
+    process = _started(how)
     for failed_s, again_s in ((1.0, 2.0), (3.0, 5.0), (15.0, 16.0), (17.0, 19.0)):
-        assert policy.failed(failed_s) == again_s
-        policy.started(again_s)
-    policy.reset(19.0)
-    assert policy.failed(20.0) == 21.0
+        assert again_at_s(process, failed_s, was_up=True) == again_s
+        _starts_again(process, again_s)
+    process.restarted_by_hand()
+    process.started(19.0)
+    assert again_at_s(process, 20.0, was_up=True) == 21.0
 
 
 @pytest.mark.parametrize(

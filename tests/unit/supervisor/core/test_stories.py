@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.build import attached_to
 from lifecycle.supervisor.control.protocol import ControlRequest
-from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, new_run
@@ -84,13 +84,13 @@ def test_a_system_is_brought_as_far_as_asked(
 def test_what_changes_while_it_is_looked_at_is_looked_at_again() -> None:
     play = Play(CHAIN, ways={"look": "hang"})
     first = play.held.pop()
-    assert play.give(inputs.Changed()) == []
-    play.give(inputs.Verified(mark=first.mark, verdict=play.found))
+    assert play.give(messages.Changed()) == []
+    play.give(messages.Verified(mark=first.mark, verdict=play.found))
     assert play.levels == "3 3"
     again = play.held.pop()
     assert again.mark > first.mark
     play.ways.clear()
-    play.give(inputs.Verified(mark=again.mark, verdict=play.found))
+    play.give(messages.Verified(mark=again.mark, verdict=play.found))
     assert play.levels == "4 4"
 
 
@@ -99,28 +99,28 @@ def test_a_node_that_is_not_as_it_was_verified_is_verified_again() -> None:
         plan_of(planned_node("camera")), ways={"camera activate": "changed", "look": "hang"}
     )
     look = play.held.pop()
-    assert play.give(inputs.Verified(mark=look.mark, verdict=play.found))[:2] == [
+    assert play.give(messages.Verified(mark=look.mark, verdict=play.found))[:2] == [
         "program",
         "camera activate",
     ]
     assert play.levels == "3"
     play.ways.clear()
     again = play.held.pop()
-    assert play.give(inputs.Verified(mark=again.mark, verdict=play.found)) == ["camera activate"]
+    assert play.give(messages.Verified(mark=again.mark, verdict=play.found)) == ["camera activate"]
     assert play.levels == "4"
 
 
 def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
     run = new_run(CHAIN, UpOptions(timeout_s=2.0))
-    take(run, 0.0, inputs.Tick())
-    take(run, 9.0, inputs.Tick())
+    take(run, 0.0, messages.Tick())
+    take(run, 9.0, messages.Tick())
     assert run.failures[0].message.endswith("within 2 s: nothing was started")
 
 
 def test_a_step_that_hangs_is_late_and_its_time_without_a_processor_is_not_counted() -> None:
     play = Play(plan_of(planned_node("camera")), ways={"camera configure": "hang"})
     play.now_s += 10.0
-    play.give(inputs.Tick(waited_s={"camera": 5.0}))
+    play.give(messages.Tick(waited_s={"camera": 5.0}))
     assert play.wait(5.0) == []
     assert play.wait(1.0) == ["signal camera 0", "sweep camera"]
     assert play.code == 6
@@ -145,9 +145,9 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     plan = plan_of(planned_node("far"), planned_node("near", after={"far": Condition.CONFIGURED}))
     play = Play(plan)
     play.run = new_run(plan, UpOptions(), own=frozenset({"near"}))
-    play.give(inputs.Tick())
+    play.give(messages.Tick())
     assert play.levels == "1"
-    play.give(inputs.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
+    play.give(messages.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
     assert play.levels == "4"
 
 
@@ -156,9 +156,9 @@ def test_what_ran_before_is_attached_to_before_anything_is_begun() -> None:
     play = Play(plan)
     play.run = new_run(plan, UpOptions(), own=frozenset({"camera", "viewer"}))
     play.run.adopting = True
-    assert play.give(inputs.Tick()) == []
+    assert play.give(messages.Tick()) == []
     attached, names = attached_to(plan, {"viewer"}), frozenset({"/viewer"})
-    asked = play.give(inputs.Adopted(plan=attached, nodes=names))
+    asked = play.give(messages.Adopted(plan=attached, nodes=names))
     assert [each for each in asked if each.startswith("spawn")] == ["spawn camera"]
     assert (sorted(play.run.nodes), play.levels) == (["camera", "viewer"], "4 4")
     assert (play.run.adopted, play.run.adopting) == (names, False)
@@ -171,7 +171,7 @@ def test_a_node_waits_for_what_another_shows_and_again_once_that_has_died(
     how = msgspec.structs.replace(AGAIN, on_failure=OnFailure.DEPENDENTS)
     viewer = planned_node("viewer", kind=RunKind.COMMAND, managed=managed, after={"camera": READY})
     play = Play(plan_of(planned_node("camera", supervision=how), viewer))
-    shows = inputs.Saw(shown={"camera": frozenset({READY})})
+    shows = messages.Saw(shown={"camera": frozenset({READY})})
     assert held in play.give(shows)
     play.die("camera")
     assert held not in play.wait(5.0)
@@ -190,7 +190,7 @@ def test_the_deadline_names_what_is_waited_for_and_where_that_is_written() -> No
 def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
     play = Play(CHAIN, stop_after_s=5.0)
     play.see(GONE)
-    play.give(inputs.Saw(left=frozenset({"/camera"})))
+    play.give(messages.Saw(left=frozenset({"/camera"})))
     play.wait(6.0)
     assert play.code == 0
 
@@ -219,10 +219,10 @@ def test_a_death_ends_the_run_unless_it_is_to_keep_going() -> None:
 def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not() -> None:
     how = msgspec.structs.replace(AGAIN, watchdog_sec=2.0)
     play = Play(chain(how))
-    play.give(inputs.Silent(node="camera", why="it hangs", hangs=True))
-    play.give(inputs.Silent(node="camera"))
+    play.give(messages.Silent(node="camera", why="it hangs", hangs=True))
+    play.give(messages.Silent(node="camera"))
     assert play.wait(3.0) == []
-    play.give(inputs.Silent(node="camera", why="it hangs", hangs=True))
+    play.give(messages.Silent(node="camera", why="it hangs", hangs=True))
     assert play.wait(2.0) == ["signal camera 9", "sweep camera"]
     assert "its watchdog ended it" in play.run.processes["camera"].failures[0].message
 
@@ -231,8 +231,8 @@ def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
     play = Play(plan_of(planned_node("base", kind=RunKind.ATTACH)))
     play.order(ControlRequest.PAUSE)
     for _ in range(5):
-        assert play.give(inputs.Saw(levels={"base": Level.ACTIVE})) == ["base deactivate"]
-    assert play.give(inputs.Saw(levels={"base": Level.ACTIVE})) == []
+        assert play.give(messages.Saw(levels={"base": Level.ACTIVE})) == ["base deactivate"]
+    assert play.give(messages.Saw(levels={"base": Level.ACTIVE})) == []
     assert play.order(ControlRequest.RESUME) == []
     assert play.answers[1][0] is ExitCode.VIOLATED
 
@@ -323,16 +323,16 @@ def test_a_gate_stays_closed_for_good_only_by_a_verdict_of_what_is_there_now() -
     play.found = verdict(INTRUDER)
     connects = play.held.pop()
     play.ways["look"] = "hang"
-    play.give(inputs.Replied(node="camera", number=connects.number, level=Level.CONNECTED))
+    play.give(messages.Replied(node="camera", number=connects.number, level=Level.CONNECTED))
     first = play.held.pop()
-    play.give(inputs.Changed())  # while it was looked
-    play.give(inputs.Verified(mark=first.mark, verdict=play.found))
+    play.give(messages.Changed())  # while it was looked
+    play.give(messages.Verified(mark=first.mark, verdict=play.found))
     play.wait(3.0)
     assert play.run.ending is None
     looks = play.held.pop()
     play.ways.clear()
     play.found = verdict()
-    play.give(inputs.Verified(mark=looks.mark, verdict=play.found))
+    play.give(messages.Verified(mark=looks.mark, verdict=play.found))
     assert play.levels == "4 4"
 
 
@@ -351,7 +351,7 @@ def test_an_endpoint_of_nobody_counts_only_where_no_process_is_coming_up(
     if restarts:
         play.ways.clear()
         asked = play.held.pop()
-        play.give(inputs.Replied(node="viewer", number=asked.number, level=Level.CONFIGURED))
+        play.give(messages.Replied(node="viewer", number=asked.number, level=Level.CONFIGURED))
     play.wait(1.0)
     assert play.levels == "4 4"
     play.wait(10.0)
@@ -369,7 +369,7 @@ def test_a_system_is_connected_again_once_its_plain_node_has_appeared() -> None:
     said = [each.reached for each in play.events if isinstance(each, SystemReached)]
     assert said == ["connected", "verified", "active"]
     before = len(play.events)
-    play.give(inputs.Replied(node="driver", number=appears.number, level=Level.STARTED))
+    play.give(messages.Replied(node="driver", number=appears.number, level=Level.STARTED))
     play.see()
     said = [each.reached for each in play.events[before:] if isinstance(each, SystemReached)]
     assert said == ["connected", "verified", "active"]
@@ -382,7 +382,7 @@ def test_an_order_waits_for_the_one_under_way_and_fits_then_or_not() -> None:
     assert play.answers == {}
     asked = play.held.pop()
     play.ways.clear()
-    play.give(inputs.Replied(node="viewer", number=asked.number, level=Level.CONNECTED))
+    play.give(messages.Replied(node="viewer", number=asked.number, level=Level.CONNECTED))
     assert [each[0] for each in play.answers.values()] == [ExitCode.OK, ExitCode.USAGE]
 
 
@@ -395,7 +395,7 @@ class _Looked(Play):
     on_the_way = True
 
     def _answer(self, effect: Any) -> Any:
-        if isinstance(effect, effects.Look):
+        if isinstance(effect, messages.Look):
             self.on_the_way = self.run.passage is not None
         return super()._answer(effect)
 
@@ -468,7 +468,7 @@ def test_a_server_that_dies_ends_the_run_unless_nodes_only_found_each_other_by_i
     finds: bool, keep_going: bool, ends: bool
 ) -> None:
     play = Play(CHAIN, keep_going=keep_going)
-    play.give(inputs.Broken(failure=SERVER_DIED, finds=finds))
+    play.give(messages.Broken(failure=SERVER_DIED, finds=finds))
     play.wait(5.0)
     (failed,) = (each for each in play.events if isinstance(each, Failure))
     assert (failed.subject, failed.message) == ("the server", "pid 7 died")
@@ -483,14 +483,14 @@ def test_a_server_that_dies_while_the_run_ends_is_passed_over() -> None:
     play = Play(CHAIN, ways={"viewer shutdown": "hang"})
     play.down()
     before = list(play.events)
-    play.give(inputs.Broken(failure=SERVER_DIED, finds=True))
+    play.give(messages.Broken(failure=SERVER_DIED, finds=True))
     assert not any(isinstance(each, Failure) for each in play.events[len(before) :])
 
 
 def test_what_is_found_beside_all_looks_ends_the_run_and_is_said() -> None:
     play = Play(CHAIN, ways={"camera connect": "hang"})
     found = verdict(INTRUDER)
-    play.give(inputs.Refused(verdict=found))
+    play.give(messages.Refused(verdict=found))
     (said,) = (each for each in play.events if isinstance(each, VerdictChanged))
     assert (said.verdict, said.stage) == (found, Stage.CONNECTED)
     play.wait(30.0)
@@ -505,7 +505,7 @@ def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code
     play.see()
     play.ways.clear()
     (held,) = play.held
-    play.give(inputs.Replied(node="viewer", number=held.number, level=Level.CONNECTED))
+    play.give(messages.Replied(node="viewer", number=held.number, level=Level.CONNECTED))
     play.wait(2.0)
     assert play.levels == "4 4"
     play.wait(30.0)

@@ -60,7 +60,7 @@ class Core:
         def module(name: str) -> Any:
             return importlib.import_module(f"{package}.{name}")
 
-        self.state, self.inputs, self.effects = module("state"), module("inputs"), module("effects")
+        self.state, self.messages = module("state"), module("messages")
         self.advance, self.gate, self.failure = module("advance"), module("gate"), module("failure")
         self.take = module("reduce").take
 
@@ -203,7 +203,7 @@ class World:
             strict=r.random() < 0.2,
         )
         self.run = core.state.new_run(self.plan, options)
-        self.give(core.inputs.Tick())
+        self.give(core.messages.Tick())
 
     # The loop
 
@@ -266,7 +266,7 @@ class World:
         self.now_s = to_s
         if self.judged_mark == self.mark:  # else what changed may have mended it
             self.see_how_long()
-        self.give(self.core.inputs.Tick())
+        self.give(self.core.messages.Tick())
 
     def see_how_long(self) -> None:
         over = self.run.ending is not None or self.seen_s is None
@@ -278,36 +278,36 @@ class World:
     # What effects do
 
     def carry_out(self, effect: Any) -> None:
-        inputs, r = self.core.inputs, self.r
+        messages, r = self.core.messages, self.r
         kind = type(effect).__name__
         if r.random() < 0.1:
             self.now_s += r.choice([0.01, 0.3, 1.0])
         if kind == "Spawn" and not self.calm and r.random() < 0.02:
-            self.give(inputs.Spawned(process=effect.process, error="no memory"))
+            self.give(messages.Spawned(process=effect.process, error="no memory"))
         elif kind == "Spawn":
             self.alive[effect.process] = True
-            self.give(inputs.Spawned(process=effect.process, pid=7))
+            self.give(messages.Spawned(process=effect.process, pid=7))
         elif kind == "Signal":
             resists = effect.process in self.stubborn and effect.number != 9
             if self.alive.get(effect.process) and not resists:
                 self.exit(effect.process, status=0 if effect.number in (0, 2) else None)
         elif kind == "Sweep":
             self.unswept.discard(effect.process)
-            self.give(inputs.Swept(process=effect.process))
+            self.give(messages.Swept(process=effect.process))
         elif kind == "Ask":
             self.answer_step(effect)
         elif kind == "Look":
             self.judged_mark = self.looks[effect.mark]
-            self.give(inputs.Verified(mark=effect.mark, verdict=self.judge()))
+            self.give(messages.Verified(mark=effect.mark, verdict=self.judge()))
         elif kind == "Show":
             if self.level_of[effect.node] and effect.node not in self.shown:
                 self.shown.add(effect.node)
-                self.give(inputs.Saw(shown={effect.node: frozenset({READY})}))
+                self.give(messages.Saw(shown={effect.node: frozenset({READY})}))
         elif kind == "Program":
-            self.give(inputs.Programmed(number=effect.number))
+            self.give(messages.Programmed(number=effect.number))
         elif kind == "Give":
             error = "refused" if not self.calm and r.random() < 0.2 else ""
-            self.give(inputs.Given(node=effect.node, error=error))
+            self.give(messages.Given(node=effect.node, error=error))
 
     def answer_step(self, effect: Any) -> None:
         node = self.run.nodes.get(effect.node)
@@ -318,7 +318,7 @@ class World:
                 level = self.core.state.Level.STARTED
                 self.mark -= 1  # and changes nothing
                 self.give(
-                    self.core.inputs.Replied(node=node.key, number=effect.number, level=level)
+                    self.core.messages.Replied(node=node.key, number=effect.number, level=level)
                 )
             return
         appears = node.planned.run.kind is RunKind.COMMAND and not node.planned.managed
@@ -329,7 +329,7 @@ class World:
             elif way == "fail":
                 level = self.core.state.Level(self.level_of[effect.node])
                 self.give(
-                    self.core.inputs.Replied(
+                    self.core.messages.Replied(
                         node=effect.node, number=effect.number, level=level, error="it failed"
                     )
                 )
@@ -344,7 +344,7 @@ class World:
             self.pending.append(Show(effect.node))
         if not level:
             self.shown.discard(effect.node)
-        self.give(self.core.inputs.Replied(node=effect.node, number=effect.number, level=level))
+        self.give(self.core.messages.Replied(node=effect.node, number=effect.number, level=level))
 
     def exit(self, process: str, *, status: int | None) -> None:
         self.alive[process] = False
@@ -357,7 +357,7 @@ class World:
         sent = self.run.processes[process].sent
         number = 0 if status is not None else sent[-1] if sent and sent[-1] else 11
         self.give(
-            self.core.inputs.Exited(
+            self.core.messages.Exited(
                 process=process,
                 status=status,
                 signal=number,
@@ -399,7 +399,7 @@ class World:
     # What breaks, and who orders what
 
     def break_something(self) -> None:
-        r, inputs = self.r, self.core.inputs
+        r, messages = self.r, self.core.messages
         self.broke_s = self.now_s
         what = r.choice([*2 * ["die"], *3 * ["order"], *_FAULTS])
         living = [name for name, lives in self.alive.items() if lives]
@@ -407,15 +407,15 @@ class World:
             self.exit(r.choice(living), status=r.choice([None, 0, 1]))
         elif what == "intrude" and self.intruder_s is None:
             self.intruder_s = self.now_s
-            self.give(inputs.Changed())
+            self.give(messages.Changed())
         elif what == "retreat" and self.intruder_s is not None:
             self.intruder_s = None
-            self.give(inputs.Changed())
+            self.give(messages.Changed())
         elif what == "linger" and self.intruder_s is None:
             self.intruder_s = self.now_s
             self.see(1.5)
             self.intruder_s = None
-            self.give(inputs.Changed())
+            self.give(messages.Changed())
         elif what == "data":
             self.data = r.choice(["ok", "measuring", "violated"])
             self.see(0.7)
@@ -424,7 +424,7 @@ class World:
             self.see(0.7)
         elif what == "hang":
             key = r.choice([*self.run.nodes, "n0"])
-            self.give(inputs.Silent(node=key, why=r.choice(["", "it hangs"]), hangs=True))
+            self.give(messages.Silent(node=key, why=r.choice(["", "it hangs"]), hangs=True))
         elif what == "order":
             self.order()
         elif what == "activate":
@@ -435,7 +435,7 @@ class World:
             held = self.level_of[key] in (2, 3) and node.planned.managed
             if held and node.request is None and not node.let_through:
                 self.level_of[key] = 4
-                self.give(inputs.Saw(levels={key: self.core.state.Level.ACTIVE}))
+                self.give(messages.Saw(levels={key: self.core.state.Level.ACTIVE}))
         else:
             self.pass_time(self.now_s + r.choice([0.2, 1.5, 6.0]))
             if r.random() < 0.05:
@@ -443,7 +443,7 @@ class World:
 
     def see(self, for_s: float) -> None:
         """Have something that changed looked at, and seen for so long."""
-        self.give(self.core.inputs.Changed())
+        self.give(self.core.messages.Changed())
         for each in [each for each in self.pending if type(each).__name__ == "Look"]:
             self.pending.remove(each)
             self.carry_out(each)
@@ -459,7 +459,7 @@ class World:
             plan=self.other_plan() if ask is ControlRequest.APPLY else None,
         )
         self.orders[order.id] = order
-        self.give(self.core.inputs.Ordered(order=order))
+        self.give(self.core.messages.Ordered(order=order))
 
     def other_plan(self) -> Plan:
         """Another manifest: nodes are left out, added, or have another program."""
@@ -489,12 +489,12 @@ class World:
         self.calm = True
         self.intruder_s, self.wrong, self.data = None, "", "ok"
         for key in self.run.nodes:
-            self.give(self.core.inputs.Silent(node=key))
-        self.give(self.core.inputs.Changed())
+            self.give(self.core.messages.Silent(node=key))
+        self.give(self.core.messages.Changed())
 
     def stop(self) -> None:
-        inputs = self.core.inputs
-        self.give(inputs.Stop(reason="lifecycle down", code=int(ExitCode.BRING_UP_FAILED)))
+        messages = self.core.messages
+        self.give(messages.Stop(reason="lifecycle down", code=ExitCode.BRING_UP_FAILED))
 
     # Promises
 

@@ -1,19 +1,23 @@
-"""What happens to a run: the inputs of `take`. Each is one fact, said once, by one port. Pure."""
+"""What happens to a run, and what is to be done: the inputs of `take`, the effects of `advance`.
+
+An input is one fact, said once, by one port; an effect is answered by the input it names. Pure.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import msgspec
 
+from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, Readiness
+from lifecycle.plan.comparison import GivenParameters
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.core.state import Level, Order, Step
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
 
-if TYPE_CHECKING:
-    from lifecycle.supervisor.core.state import Level, Order
+# Inputs
 
 
 class Tick(msgspec.Struct, frozen=True, kw_only=True):
@@ -153,16 +157,13 @@ class Ordered(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stop(msgspec.Struct, frozen=True, kw_only=True):
-    """The run is to end: `lifecycle down`, a signal.
+    """The run is to end: `lifecycle down`, a signal; `code`: of a run that is cut short by it.
 
-    Attributes:
-        code: of a run that is cut short by it.
-        hurries: said again while the system is taken down, nothing is asked politely any more.
+    After an interrupt while the system is taken down nothing is asked politely any more.
     """
 
     reason: str
-    code: int
-    hurries: bool = False
+    code: ExitCode
 
 
 class Silent(msgspec.Struct, frozen=True, kw_only=True):
@@ -208,3 +209,76 @@ Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
     | Ordered | Stop | Silent | Adopted | Refused | Broken
 )  # fmt: skip
+
+
+# Effects
+
+
+class Spawn(msgspec.Struct, frozen=True, kw_only=True):
+    """Start a process; `Spawned`, and later one `Exited`."""
+
+    process: str
+
+
+class Signal(msgspec.Struct, frozen=True, kw_only=True):
+    """Send a process a signal; 0: close its control channel, by which a host of ours ends."""
+
+    process: str
+    number: int
+
+
+class Sweep(msgspec.Struct, frozen=True, kw_only=True):
+    """End what a process left, and wait until the graph has forgotten its nodes; `Swept`."""
+
+    process: str
+
+
+class Ask(msgspec.Struct, frozen=True, kw_only=True):
+    """Ask a node for a step; `Replied`.
+
+    Attributes:
+        number: given back in the answer: one to a request that was given up is nobody's.
+        mark: for ACTIVATE: it may leave only while this is the run's mark, else `Replied(changed)`.
+    """
+
+    node: str
+    step: Step
+    number: int
+    mark: int = -1
+
+
+class Look(msgspec.Struct, frozen=True, kw_only=True):
+    """Observe and judge; `Verified`, with the mark at which it began: this one, or a later one."""
+
+    mark: int
+
+
+class Program(msgspec.Struct, frozen=True, kw_only=True):
+    """Program networks with the flows of a verdict; `Programmed` with the same number."""
+
+    verdict: Verdict
+    number: int
+
+
+class Give(msgspec.Struct, frozen=True, kw_only=True):
+    """Set parameters of a running node, None for all of its mode; `Given`."""
+
+    node: str
+    values: GivenParameters | None = None
+
+
+class Answer(msgspec.Struct, frozen=True, kw_only=True):
+    """Answer an order, by its number."""
+
+    order: int
+    code: ExitCode
+    error: str = ""
+
+
+class Wake(msgspec.Struct, frozen=True, kw_only=True):
+    """Send a `Tick` at this time, if nothing happens before."""
+
+    at_s: float
+
+
+Effect = Spawn | Signal | Sweep | Ask | Look | Program | Give | Answer | Wake

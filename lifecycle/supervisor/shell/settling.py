@@ -1,11 +1,15 @@
-"""What may pass by itself while a system is watched, and for how long.
+"""What a verdict must not be misled by: what passes by itself, and that we stood still.
 
 Owns: `GracePeriod`: the facts of one change arrive one by one, and a verdict that is worse by what
-is not known yet alone is kept back for a moment. The gate itself has no grace period. Pure.
+is not known yet alone is kept back for a moment. The gate itself has no grace period. And
+`Standstill`: this process was stopped or frozen, or its machine slept. What arrives meanwhile waits
+in the kernel, and the middleware needs a moment to take it in: no verdict of before is one of now.
 """
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind
@@ -23,6 +27,10 @@ from lifecycle.verify.verdict import Finding, FindingKey, Verdict
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
+
+_BEAT_S = 0.1
+STILL_S = 0.25
+"""A loop without a turn for so long, which did not compute either, stood still."""
 
 _Place = tuple[object, ...]
 
@@ -44,15 +52,9 @@ class GracePeriod:
     def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
     ) -> tuple[Verdict, float | None]:
-        """Return the verdict that holds, and after how many seconds it has to be judged again.
+        """Return the verdict that holds, and in how many seconds to judge again, if at all.
 
-        The seconds are None where what was found now holds.
-
-        Args:
-            last: the verdict that holds so far; None before the first.
-            verdict: what was found now.
-            expected: the plan that it was judged against.
-            now_s: on any clock that only goes forward.
+        `last` held so far; None before the first.
         """
         self._note(verdict, expected, now_s)
         before = set() if last is None else {each.key for each in last.findings}
@@ -126,3 +128,34 @@ def _demands(plan: Plan) -> Iterator[tuple[_Place, str]]:
     for flow in plan.flows:
         ends = f"{names[flow.publisher]} → {names[flow.subscription]}"
         yield (f"{flow.topic}: {ends}",), flow.medium
+
+
+class Standstill:
+    """Counts for how often the running loop stood still; `close` it."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._count = 0
+        self._last_s, self._cpu_s = _now_s(), time.thread_time()
+        self._timer = self._loop.call_later(_BEAT_S, self._beat)
+
+    def count(self) -> int:
+        """Return how often it stood still until this very moment; call it in the loop."""
+        now_s, cpu_s = _now_s(), time.thread_time()
+        if now_s - self._last_s - (cpu_s - self._cpu_s) > STILL_S:
+            self._count += 1
+        self._last_s, self._cpu_s = now_s, cpu_s
+        return self._count
+
+    def close(self) -> None:
+        """Notice nothing more."""
+        self._timer.cancel()
+
+    def _beat(self) -> None:
+        self.count()
+        self._timer = self._loop.call_later(_BEAT_S, self._beat)
+
+
+def _now_s() -> float:
+    """Return the time of CLOCK_BOOTTIME, which also goes on while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)

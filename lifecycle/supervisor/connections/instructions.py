@@ -1,9 +1,10 @@
-"""Negotiates connections from node configurations: the parties, desired state, the expected plan.
+"""Connections and mappings of nodes: those that each must have, has, and still lacks.
 
-Owns: `NegotiatedSource`: which nodes take part, on which host each is, and how the outcome reaches
-nodes and the verifier; `party_of`: a node as a party, from its configuration, under what its
-manifest declares; and `expected_by_onlooker`: the same for an observer that decides nothing. The
-rules of negotiation are lifecycle.plan's. Pure.
+Owns: `Instructions`, and `steps`, the difference of two in the order in which it is made, so that
+the first wiring, a change and what was lost are one case; what nodes must have by the plan, or by a
+negotiation (`NegotiatedSource`): which nodes take part, on which host each is, and how the outcome
+reaches nodes and the verifier; and `expected_by_onlooker`: the same for an observer that decides
+nothing. The rules of negotiation are lifecycle.plan's. Pure.
 
 What the authority of such a system decided is in no manifest, but negotiation is a pure function:
 the same node configurations always result in the same data layer graph, but for ports and groups
@@ -12,14 +13,17 @@ that were given out earlier, and those are in the nodes' reports.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Iterator, Mapping
 
+import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.discovery import contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
@@ -42,13 +46,113 @@ from lifecycle.plan.parties import (
     wishes_of,
 )
 from lifecycle.plan.wiring import with_graph
-from lifecycle.supervisor.connections.desired_state import (
-    Instructions,
-    not_wired,
-    planned_instructions,
-)
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.catalogue import NOT_WIRED, node_of
 from lifecycle.verify.verdict import Finding
+
+
+class Instructions(msgspec.Struct, frozen=True, kw_only=True):
+    """What one node must have, or what it has.
+
+    Attributes:
+        node: fully qualified name.
+        connections: (name, how it is connected), in the order in which they are made.
+        mappings: (endpoint as `publishers/video`, name of its connection); an empty name is the
+            node's own participant.
+    """
+
+    node: str
+    connections: tuple[tuple[str, ParticipantConnections], ...] = ()
+    mappings: tuple[tuple[str, str], ...] = ()
+
+
+def planned_instructions(node: PlannedNode) -> Instructions:
+    """Return what the plan instructs a node to do.
+
+    A participant that is no connection, made only to distinguish a publisher's flow, is the
+    node's own to make: for its publisher, the node's own participant is named in its place.
+    """
+    named = {each.name: each for each in node.participants if each.connection}
+    return Instructions(
+        node=node.full_name,
+        connections=tuple((each.connection, each.connections) for each in named.values()),
+        mappings=tuple(
+            (
+                each.kind.spell(each.name),
+                named[each.participant].connection if each.participant in named else "",
+            )
+            for each in node.endpoints
+        ),
+    )
+
+
+def by_plan(plan: Plan) -> Mapping[str, Instructions]:
+    """Return what the plan instructs each managed node to do, by full name."""
+    return {each.full_name: planned_instructions(each) for each in plan.nodes if each.managed}
+
+
+def wired(configuration: NodeConfiguration) -> Instructions:
+    """Return what a node says that it has; what it could not make it has not."""
+    return Instructions(
+        node=configuration.name,
+        connections=tuple(
+            (each.name, ParticipantConnections(urls=each.urls))
+            for each in configuration.connections
+            if each.name and not each.error
+        ),
+        mappings=tuple(
+            (each.kind.spell(each.name or each.resolved), each.connection)
+            for each in configuration.endpoints
+            if each.mapped
+        ),
+    )
+
+
+def steps(
+    wanted: Instructions, has: Instructions, *, ours: Collection[str] = ()
+) -> tuple[Command, ...]:
+    """Return what is missing, in the order in which it is made: make before break.
+
+    A connection whose URLs differ cannot be had twice under one name: it alone is broken first.
+    `ours`: names of connections that this authority made; others are not its to break.
+    """
+    step = functools.partial(Command, node=wanted.node)
+    connections, mappings = dict(has.connections), dict(has.mappings)
+    made: list[Command] = []
+    stale: set[str] = set()
+    for name, how in wanted.connections:
+        if name in connections:
+            if connections[name].urls == how.urls:
+                continue
+            stale.add(name)
+            made.append(step(operation=Operation.DISCONNECT_FROM, connection=name))
+        made.append(step(operation=Operation.CONNECT_TO, connection=name, connections=how))
+    for endpoint, name in wanted.mappings:
+        if name in stale or mappings.get(endpoint) != name:
+            made.append(step(operation=Operation.MAP_TO, connection=name, endpoint=endpoint))
+    needed = {name for name, _ in wanted.connections}
+    made += [
+        step(operation=Operation.DISCONNECT_FROM, connection=name)
+        for name in connections
+        if name in ours and name not in needed
+    ]
+    return tuple(made)
+
+
+def not_wired(subject: str, message: str) -> Finding:
+    """Return the finding that a node, or the system, could not be wired."""
+    return NOT_WIRED.finding(
+        outcome=Outcome.VIOLATED,
+        subject=subject,
+        expected="wired",
+        observed="not wired",
+        message=message,
+        node=node_of(subject),
+    )
+
+
+# Negotiation
 
 
 def party_of(
@@ -209,24 +313,16 @@ class NegotiatedSource:
             if {each.publisher, each.subscription} <= keys
         )
         self.expected = _with_flows(with_graph(self._grown(known), graph), graph)
-        instructions = {
-            node.full_name: planned_instructions(node)
-            for node in self.expected.nodes
-            if node.managed
-        }
+        instructions = dict(by_plan(self.expected))
         for each in unplanned:
             instructions[each.name] = _unplanned_instructions(each, graph, before)
         self._instructions = instructions
         return instructions
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Negotiate again for nodes that are started again, and never the TCP ports they had.
+        """Negotiate again for nodes that are started again, new or gone, on other TCP ports.
 
-        Fast DDS would not find them there (see lifecycle.plan.restart).
-
-        Args:
-            plan: as it is now; of another manifest, it has other nodes and flows.
-            names: of the nodes that are started again, of new ones and of those that are gone.
+        Fast DDS would not find them where they were (see lifecycle.plan.restart).
         """
         keys = {self._planned[name].key for name in names if name in self._planned}
         taken = {host: set(ports) for host, ports in self._terms.taken.items()}
@@ -296,7 +392,6 @@ def _with_made(node: PlannedNode, configuration: NodeConfiguration) -> PlannedNo
 
 
 def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
-    """Add the flows of endpoints that were made in code."""
     keys = {each.key for each in plan.nodes}
     there = {(each.topic, each.publisher, each.subscription) for each in plan.flows}
     more = {
