@@ -101,16 +101,6 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def is_inside(flow: NegotiatedFlow) -> bool:
-    """Return whether a flow is handed over inside a process."""
-    return flow.medium == Medium.INTRAPROCESS
-
-
-def is_by_group(flow: NegotiatedFlow) -> bool:
-    """Return whether one datagram of a flow goes to a group."""
-    return flow.medium == Medium.UDPM
-
-
 MEETING = Medium.SHM
 """By what participants of one process find each other, if they have nothing else in common."""
 
