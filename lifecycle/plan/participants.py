@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from lifecycle.manifest.flows import ParticipantGroup
-from lifecycle.manifest.model import (
-    ConnectionDeclaration,
-)
+from lifecycle.manifest.model import ConnectionDeclaration
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import (
     ParticipantConnections,

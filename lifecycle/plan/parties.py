@@ -11,12 +11,7 @@ from types import MappingProxyType
 
 import msgspec
 
-from lifecycle.manifest.model import (
-    DiscoveryMode,
-    EndpointKind,
-    FlowTransport,
-    RunKind,
-)
+from lifecycle.manifest.model import DiscoveryMode, EndpointKind, FlowTransport, RunKind
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import (
     BUILTIN_TRANSPORTS,
@@ -30,13 +25,7 @@ from lifecycle.network.medium import (
 )
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.discovery import Contact, Hosts, contacts_of, is_fixed, ports_of
-from lifecycle.plan.model import (
-    Plan,
-    PlannedEndpoint,
-    PlannedFlow,
-    PlannedNode,
-    PlannedParticipant,
-)
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode, PlannedParticipant
 
 End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""

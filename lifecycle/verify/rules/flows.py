@@ -24,20 +24,10 @@ from lifecycle.manifest.model import EndpointKind, FlowTransport, UniqueHow
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
-from lifecycle.network.nfe import (
-    NetworkFlowEndpoint,
-    TransportProtocol,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.plan.restart import is_restarted_url
-from lifecycle.verify.network_flows import (
-    NONE,
-    UNKNOWN,
-    Uniqueness,
-    effective_transport,
-    meets,
-)
+from lifecycle.verify.network_flows import NONE, UNKNOWN, Uniqueness, effective_transport, meets
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.state import MISSING_REPORT

@@ -27,13 +27,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import (
-    Actual,
-    FlowView,
-    SeenEndpoint,
-    View,
-    brings_up,
-)
+from lifecycle.verify.view import Actual, FlowView, SeenEndpoint, View, brings_up
 
 _rule = functools.partial(
     Rule,

@@ -21,12 +21,7 @@ from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import (
-    Actual,
-    NodeFacts,
-    SeenEndpoint,
-    View,
-)
+from lifecycle.verify.view import Actual, NodeFacts, SeenEndpoint, View
 
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",

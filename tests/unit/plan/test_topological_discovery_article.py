@@ -30,13 +30,7 @@ from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.plan.negotiate import negotiate
-from lifecycle.plan.parties import (
-    DataLayerGraph,
-    hosts_of,
-    party_of_node,
-    terms_of,
-    wishes_of,
-)
+from lifecycle.plan.parties import DataLayerGraph, hosts_of, party_of_node, terms_of, wishes_of
 from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import Identity, NodeConfiguration
