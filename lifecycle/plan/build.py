@@ -1,10 +1,8 @@
 """Build the plan of a manifest: start order (`after:`), processes, flows, participants, discovery.
 
 Owns: `build_plan`, which puts the parts of this package together, and `check_plan`, which only
-reports whether that can be done; `dependency_levels`, the longest-path layering of the `after:`
-graph; which publisher → subscription pairs a system has, and what `links:` demand of them; grouping
-nodes into operating system processes, their argv and environment. Nothing here starts anything.
-Pure but for the environment, for finding executables and for reading parameter files.
+reports whether that can be done. Nothing here starts anything. Pure but for the environment, for
+finding executables and for reading parameter files.
 """
 
 from __future__ import annotations
@@ -147,8 +145,7 @@ def build_plan(
 
     Args:
         manifest: valid, as `lifecycle.manifest.loading` returns it.
-        environment: variables to read ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE,
-            RMW_IMPLEMENTATION and AMENT_PREFIX_PATH from; None takes this process's own.
+        environment: None takes this process's own.
         domain_id: 0–232, in the place of the manifest's; None leaves that.
 
     Raises:
@@ -198,12 +195,8 @@ def with_files_of_now(plan: Plan) -> Plan:
 def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
     """Return a plan that starts all but some nodes: it waits for those, as for attached ones.
 
-    Args:
-        plan: of the whole system.
-        names: keys or fully qualified names.
-
     Raises:
-        UsageError: no such node, or another one of its process is not named.
+        UsageError: no node has this key or full name, or another one of its process is not named.
     """
     chosen = {find_node(plan, name).key for name in names}
     for process in plan.processes:

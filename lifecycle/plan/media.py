@@ -14,8 +14,7 @@ The first rule that applies decides; what both ends cannot have is a problem wit
     not be lost and are more than one datagram; else what is there anyway, UDP, TCP.
 
 An end that asked for something else than what was chosen, where no link decides, is a problem.
-
-Owns: `carried`, what Fast DDS does with two participants, and `choose`, these rules. Pure.
+Pure.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Negotiate transports and connections: node configurations, placement, hints → data layer graph.
 
-Owns: `negotiate`, which has a medium chosen for every publisher → subscription pair (`media`), and
-gives a node a connection only where its own participant would not carry the data anyway; and
-`connections_of`, as few connections as carry the endpoints that leave it. What exists already keeps
-its name and, while its transports are the same, its URLs. Deterministic, and independent of the
-order of the parties: equal systems have equal names, ports and groups. Pure.
+A node gets a connection only where its own participant would not carry the data anyway, and as few
+as carry its endpoints. What exists already keeps its name and, while its transports are the same,
+its URLs. Deterministic, and independent of the order of the parties: equal systems have equal
+names, ports and groups. Pure.
 """
 
 from __future__ import annotations
@@ -46,14 +45,8 @@ def negotiate(
     """Choose how data get from every publisher to every subscription of its topic.
 
     The rules are in `media.py`. What cannot be made is a problem; everything else is negotiated all
-    the same.
-
-    Args:
-        parties: nodes with their endpoints, in any order.
-        wishes: what links demand.
-        terms: what the system gives.
-        before: what is there already: connections that still fit keep their names, ports, groups
-            and URLs, so that little is made anew.
+    the same. Of what is there `before`, connections that still fit keep their names, ports, groups
+    and URLs, so that little is made anew.
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
     chosen = _choices(pairs, terms)

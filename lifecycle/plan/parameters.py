@@ -1,8 +1,5 @@
 """Expected parameter values of a node: declared parameters with the values that override them.
 
-Owns: from the manifest's sources of values to `ExpectedParameter`, and the one spelling of
-values that are compared. Reads parameter files, whose layout the checks know.
-
 Values are taken, weakest first, from a declaration's default, what a `command:` itself sets after
 `--ros-args`, the parameter files, and `parameters:`. Among the sections of files rcl has an order
 of its own (measured, rclpy 7.1): sections of one name are one, at the place of the first of them,

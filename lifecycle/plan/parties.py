@@ -175,13 +175,9 @@ _NO_VARIABLES: Mapping[str, str] = MappingProxyType({})
 def party_of_node(
     node: PlannedNode, hosts: Hosts, *, rmw: str, variables: Mapping[str, str] = _NO_VARIABLES
 ) -> Party:
-    """Return a node as a party, from what its manifest declares alone.
+    """Return a node without negotiated participants as a party, from its manifest alone.
 
-    Args:
-        node: without negotiated participants.
-        hosts: of the system.
-        rmw: the RMW identifier that it runs with.
-        variables: what a COMMAND node's process gets beside its own.
+    `variables` are what a COMMAND node's process gets beside its own.
     """
     host = hosts.host(node.machine)
     known = rmw.startswith(FAST_DDS)

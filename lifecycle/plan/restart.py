@@ -1,6 +1,4 @@
-"""Restart nodes while others keep running: new TCP ports and peers for their participants.
-
-Owns: `restarted`, `moved_observer`, `moving_nodes` and `is_restarted_url`. Pure.
+"""Restart nodes while others keep running: new TCP ports and peers for their participants. Pure.
 
 Fast DDS 2.14 keeps an accepted TCP connection under the listening port that its dialler names, also
 once that one is gone, and takes no other in its place: a participant that returns on the same port

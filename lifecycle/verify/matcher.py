@@ -1,7 +1,6 @@
 """Matches declared endpoints with those observed in the ROS graph and in node reports.
 
-Owns: `lay_out`: which observed endpoint and which report belong to which declared endpoint, and
-what is left over. All rules read the result, so that they agree on what is the same thing. Pure.
+All rules read the result, so that they agree on what is the same thing. Pure.
 """
 
 from __future__ import annotations
@@ -67,16 +66,7 @@ def lay_out(
     ahead: frozenset[str] = frozenset(),
     over: Mapping[str, str] | None = None,
 ) -> View:
-    """Match everything observed to everything planned; deterministic for any input order.
-
-    Args:
-        plan: what must be.
-        observation: what was seen.
-        stage: which moment it is judged against.
-        machines: as `View` has them, and `ahead`, and `over`.
-        ahead: see there.
-        over: see there.
-    """
+    """Match everything observed to everything planned; deterministic for any input order."""
     planned = {node.full_name: node for node in plan.nodes}
     names = DeclaredNames.of(plan)
     reported = _by_identity(observation)
@@ -155,10 +145,7 @@ def _attributed(
 
     Services have no GID of their own in reports: one whose node is not known is that of the node on
     its participant that declares it. What client libraries bring along is left out here, unless it
-    is declared; under a declared name, unless it is a declared node's.
-
-    Returns:
-        The endpoints by the name of the node whose they are, sorted by it.
+    is declared; under a declared name, unless it is a declared node's. By node name, sorted.
     """
     hidden = owners(names.nodes, reported)
     shown: dict[str, list[ObservedEndpoint]] = {}

@@ -1,7 +1,5 @@
 """Decides when a publisher and a subscription are matched; rules about pairs and clients. Pure.
 
-Owns: `match` and `obstacle`, by which the rules here and `lifecycle.graph`'s links judge a pair.
-
 Judged pair by pair: each end that reports counts the peers that it is matched with. A count that is
 that of all endpoints of the graph that can match it, tools' included, proves the pair; a lower one
 is settled by the other end's, and one of zero is a violation. Where neither end reports, discovery
@@ -100,14 +98,8 @@ def match(
 ) -> Match | None:
     """Judge whether two ends that can match are matched, by what both say of each other.
 
-    Args:
-        publisher: one end.
-        subscription: the other end.
-        publishers: every publisher of the topic in the graph, tools' included.
-        subscriptions: likewise.
-
-    Returns:
-        None if neither end reports its matches.
+    `publishers` and `subscriptions` are all of the topic in the graph, tools' included. None if
+    neither end reports its matches.
     """
     answers = [
         answer

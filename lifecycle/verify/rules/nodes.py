@@ -1,9 +1,8 @@
 """Rules about node names: missing, undeclared, duplicate; and endpoints of undeclared nodes. Pure.
 
-What decides on an endpoint of a tolerated tool or an unknown node is what it does, not what its
-node is called: a publisher on a declared topic and a server of a declared service or action feed
-the system, whichever node owns them. A node that only subscribes or calls is tolerated where the
-policy names it.
+A publisher on a declared topic and a server of a declared service or action feed the system,
+whatever their node is called. One that only subscribes or calls is tolerated where the policy names
+it.
 """
 
 from __future__ import annotations
