@@ -229,8 +229,7 @@ def _tools(
 def _by_place(matched: Iterable[Actual]) -> dict[tuple[EndpointKind, str], tuple[Actual, ...]]:
     ends: dict[tuple[EndpointKind, str], tuple[Actual, ...]] = {}
     for each in matched:
-        place = (each.planned.kind, each.planned.resolved)
-        ends[place] = (*ends.get(place, ()), each)
+        ends[each.kind, each.name] = (*ends.get((each.kind, each.name), ()), each)
     return ends
 
 
@@ -273,15 +272,7 @@ def _match_node(
                 observed = _as_observed(node, report) if _is_there(report) else None
             if report is not None:
                 reports[_left_key(report)].remove(report)
-            matched[index] = Actual(
-                node=node,
-                planned=planned,
-                observed=observed,
-                report=report,
-                end=_end(node, planned, observed, report),
-                unseen=unseen,
-                beyond=beyond,
-            )
+            matched[index] = _actual(node, planned, observed, report, unseen=unseen, beyond=beyond)
     rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
     rest += [
         _as_observed(node, actual.report)
@@ -368,10 +359,7 @@ def _undeclared(
         for each in group
         if not each.kind.is_topic
     }
-    declared = {
-        (each.node.full_name, each.planned.kind, each.planned.resolved): each.planned.type
-        for each in actual
-    }
+    declared = {(each.node, each.kind, each.name): each.planned.type for each in actual}
 
     def is_half(endpoint: ObservedEndpoint) -> bool:
         action = action_part(endpoint.kind, endpoint.name)
@@ -402,28 +390,34 @@ def _graph_nodes(
     return merged
 
 
-def _end(
+def _actual(
     node: PlannedNode,
     planned: PlannedEndpoint,
     observed: ObservedEndpoint | None,
     report: EndpointReport | None,
-) -> SeenEndpoint:
+    *,
+    unseen: bool,
+    beyond: bool,
+) -> Actual:
     """Return a declared endpoint with all that is known of it."""
-    shown = observed.qos if observed else None
     type_hash = observed.type_hash if observed else None
     if not type_hash and report is not None and report.type_hash is not None:
         # Discovery wins where it knows a hash; with static discovery only the node itself does.
         type_hash = report.type_hash
-    return SeenEndpoint(
+    return Actual(
         kind=planned.kind,
         node=node.full_name,
         name=planned.resolved,
         type=observed.type if observed else planned.type,
-        qos=actual_qos(shown, report.qos if report else None),
+        qos=actual_qos(observed.qos if observed else None, report.qos if report else None),
         report=report,
         planned=planned,
         type_hash=type_hash,
-        observed=observed is not None or report is not None,
+        is_shown=observed is not None or report is not None,
+        owner=node,
+        observed=observed,
+        unseen=unseen,
+        beyond=beyond,
     )
 
 
@@ -433,17 +427,17 @@ def _seen(
     tools: Collection[str],
 ) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
-    topical = [each for each in actual if each.planned.kind.is_topic]
+    topical = [each for each in actual if each.kind.is_topic]
     # Not visible here, but the endpoints that match them count them.
-    found = [each.end for each in topical if each.beyond and each.observed is None]
-    declared = {id(each.observed): each.end for each in topical if each.observed is not None}
+    found: list[SeenEndpoint] = [each for each in topical if each.beyond and each.observed is None]
+    declared = {id(each.observed): each for each in topical if each.observed is not None}
     found += [
         declared.get(id(each)) or SeenEndpoint.of(each)
         for name, group in groups.items()
         if name not in tools
         for each in _topical(group)
     ]
-    found += [each.end for each in topical if each.unseen and each.observed is not None]
+    found += [each for each in topical if each.unseen and each.observed is not None]
     return tuple(found)
 
 

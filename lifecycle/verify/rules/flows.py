@@ -139,16 +139,15 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
     report = actual.report
     if report is None or report.error or not report.mapped:
         return  # that is judged as an endpoint
-    wanted = connection_of(actual.node, actual.planned)
+    wanted = connection_of(actual.owner, actual.planned)
     if report.connection == wanted:
         return
-    node, planned = actual.node, actual.planned
     yield WRONG_MAPPING.on(
         actual,
         expected=_spell_connection(wanted),
         observed=_spell_connection(report.connection),
-        message=f"the {planned.kind.noun} of {planned.resolved} in"
-        f" {node.full_name} is mapped onto {_spell_connection(report.connection)} and must be onto"
+        message=f"the {actual.kind.noun} of {actual.name} in"
+        f" {actual.node} is mapped onto {_spell_connection(report.connection)} and must be onto"
         f" {_spell_connection(wanted)}",
     )
 
@@ -250,7 +249,7 @@ def _broken(actual: Actual) -> Iterator[Finding]:
             expected="at least one network flow endpoint",
             observed="none",
             message=f"nothing reaches the subscription of {planned.resolved} in"
-            f" {actual.node.full_name}: it has no network flow endpoint",
+            f" {actual.node}: it has no network flow endpoint",
         )
 
 
@@ -261,7 +260,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     if report is not None and (report.error or report.nfes == ()):
         return  # not made, or broken: that is said already
     word = planned.kind.noun
-    where = f"the {word} of {planned.resolved} in {actual.node.full_name}"
+    where = f"the {word} of {planned.resolved} in {actual.node}"
     unique = uniqueness.is_unique(actual)
     if unique is None:
         yield UNVERIFIABLE.on(
@@ -308,7 +307,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
 def _why_unproven(actual: Actual) -> str:
     """Return why the network flow endpoints of an endpoint, or of its neighbours, are not known."""
     if actual.report is None:
-        return f"{actual.node.full_name} does not report its network flow endpoints"
+        return f"{actual.node} does not report its network flow endpoints"
     if actual.report.nfes is None:
         return "its RMW does not report network flow endpoints"
     return "its process has endpoints whose network flow endpoints are not reported"
@@ -365,8 +364,8 @@ def _is_decided(view: View, flow: FlowView) -> bool:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
-        or connection_of(end.node, end.planned)
-        or end.node.connections.urls
+        or connection_of(end.owner, end.planned)
+        or end.owner.connections.urls
         for end in (*flow.publishers, *flow.subscriptions)
     )
 
@@ -430,7 +429,7 @@ def _judge_dscp(actual: Actual) -> Iterator[Finding]:
     wanted, read = planned.dscp, report.dscp if report else None
     if wanted is None:
         return
-    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node.full_name}"
+    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node}"
     if read is None:
         yield DSCP_UNVERIFIABLE.on(
             actual,

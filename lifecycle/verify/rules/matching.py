@@ -149,21 +149,20 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         report = actual.report
         if report is None or not report.matched or not actual.planned.kind.is_topic:
             continue
-        if not brings_up(actual.node, view.machines):
+        if not brings_up(actual.owner, view.machines):
             continue
-        publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
-        end = actual.end
-        publishes = end.kind is EndpointKind.PUBLISHER
-        possible = len(_possible(end, subscriptions if publishes else publishers))
-        other = EndpointKind.SUBSCRIPTION if publishes else EndpointKind.PUBLISHER
-        place = (other, actual.planned.resolved)
+        publishers, subscriptions = topics.get(actual.name, _NO_ENDS)
+        publishes = actual.kind is EndpointKind.PUBLISHER
+        possible = len(_possible(actual, subscriptions if publishes else publishers))
+        other = actual.kind.other_end
+        place = (other, actual.name)
         if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
             continue
         yield UNKNOWN_PEER.on(
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
-            message=f"the {end.kind.noun} of {actual.planned.resolved} in {actual.node.full_name} "
+            message=f"the {actual.kind.noun} of {actual.name} in {actual.node} "
             f"is matched with more than the graph shows: it counts {report.matched}, and the graph "
             f"shows {possible} that can match it",
         )
@@ -232,7 +231,7 @@ def _cause(flow: FlowView) -> str:
             return f"the {word} is missing"
     for publisher in flow.publishers:
         for subscription in flow.subscriptions:
-            if cause := obstacle(publisher.end, subscription.end):
+            if cause := obstacle(publisher, subscription):
                 return cause
     return ""
 
@@ -240,7 +239,7 @@ def _cause(flow: FlowView) -> str:
 def _judge(flow: FlowView, ends: _Ends) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
-        match(publisher.end, subscription.end, *ends)
+        match(publisher, subscription, *ends)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -307,7 +306,7 @@ def _clients(view: View) -> Iterator[Finding]:
     servers: dict[_Place, list[str]] = {}
     for actual in view.actual:
         if actual.observed is not None and actual.observed.kind in _SERVERS:
-            servers.setdefault(_place(actual.observed), []).append(actual.node.full_name)
+            servers.setdefault(_place(actual.observed), []).append(actual.node)
     if not servers:
         return
     others = Counter(
@@ -343,7 +342,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
         reason = f"it has {count} servers, and the client does not report which it is matched with"
     else:
         return
-    name, node = client.planned.resolved, client.node.full_name
+    name, node = client.planned.resolved, client.node
     says, state = "", "are not matched"
     if outcome is not Outcome.VIOLATED:
         says, state = "nothing proves that ", "are matched"

@@ -383,10 +383,9 @@ def _unmeasured_at(
             subject=topic,
             expected=str(quantity),
             observed="not measured",
-            message=f"{quantity} of the {noun} of {topic} in {actual.node.full_name} is not"
-            f" measured: {why}",
+            message=f"{quantity} of the {noun} of {topic} in {actual.node} is not measured: {why}",
             at=quantity.at,
-            node=actual.node.full_name,
+            node=actual.node,
             endpoint=actual.planned.kind,
         )
 
