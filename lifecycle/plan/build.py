@@ -60,6 +60,7 @@ from lifecycle.plan.parameters import NodeParameters, portable
 from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
 from lifecycle.plan.wiring import variables_of, wire
+from lifecycle.printable import listed
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
@@ -285,18 +286,14 @@ def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[D
         if each.name == SIM_TIME and each.value is True
     ]
     if users:
-        names = ", ".join(node.key for node, _ in users[:_NAMED])
-        more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
+        names = listed([node.key for node, _ in users], 4)
         yield warning(
             "check.no-clock",
             users[0][1].at,
-            f"cannot tell who gives {names}{more} simulated time: no node declares a publisher of"
+            f"cannot tell who gives {names} simulated time: no node declares a publisher of"
             " '/clock'",
             "declare it in the simulator's node, or start what publishes it before",
         )
-
-
-_NAMED = 4
 
 
 def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodeParameters) -> Plan:

@@ -153,8 +153,7 @@ def _expected(name: str, type_: str, given: _Given) -> ExpectedParameter:
 
 def as_type(value: ParameterValue, type_: str) -> ParameterValue:
     """Return `value` as a parameter of `type_` has it: YAML writes 5 where a double is meant."""
-    one = type_.removesuffix("_array")
-    if one != "double":
+    if type_.removesuffix("_array") != "double":
         return value
     if isinstance(value, tuple):
         return tuple(float(each) if _is_int(each) else each for each in value)

@@ -39,7 +39,6 @@ from lifecycle.verify.view import (
     SeenEndpoint,
     View,
     actual_qos,
-    declared_addresses,
     is_beyond,
     may_hide,
 )
@@ -121,7 +120,9 @@ def lay_out(
         seen=_seen(groups, actual, tools),
         seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
         flows=_flows(plan, nodes),
-        uniqueness=Uniqueness(reported, declared_addresses(plan)),
+        uniqueness=Uniqueness(
+            reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
+        ),
         measured=observation.measured,
         clocks=None if observation.clocks is None else dict(observation.clocks),
         marks={(each.machine, each.dscp): each.arrives_as for each in observation.marks},
@@ -129,10 +130,8 @@ def lay_out(
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
-    by_name = sorted(observation.configurations, key=lambda each: each.name)
-    if all(one.name != other.name for one, other in itertools.pairwise(by_name)):
-        return tuple(by_name)
-    return tuple(sorted(by_name, key=lambda each: (each.name, repr(each.identity))))
+    found = observation.configurations
+    return tuple(sorted(found, key=lambda each: (each.name, repr(each.identity))))
 
 
 def _attributed(

@@ -260,14 +260,6 @@ def is_beyond(node: PlannedNode, machines: frozenset[str] | None) -> bool:
     return not brings_up(node, machines) and only_shared_memory(node.connections)
 
 
-def declared_addresses(plan: Plan) -> dict[str, str]:
-    """Return the declared address of each node's machine, by full node name, where there is one."""
-    machines = {each.name: each.address for each in plan.machines if each.address}
-    return {
-        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
-    }
-
-
 def only_shared_memory(connections: ParticipantConnections) -> bool:
     """Return whether a participant is known to have nothing but shared memory."""
     scheme = f"{Medium.SHM}:"

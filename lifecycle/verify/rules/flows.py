@@ -21,12 +21,11 @@ import functools
 from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport, UniqueHow
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
-from lifecycle.plan.restart import is_restarted_url
+from lifecycle.plan.restart import is_same_url
 from lifecycle.verify.network_flows import NONE, UNKNOWN, Uniqueness, effective_transport, meets
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -123,7 +122,10 @@ def _connection(
 def _urls(
     node: PlannedNode, report: ConnectionReport, planned: ParticipantConnections, first_port: int
 ) -> Iterator[Finding]:
-    if _as_planned(report.urls, planned.urls, first_port=first_port):
+    pairs = zip(planned.urls, report.urls, strict=False)
+    if len(planned.urls) == len(report.urls) and all(
+        is_same_url(*each, first_port=first_port) for each in pairs
+    ):
         return
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield OTHER_CONNECTION.on(
@@ -150,34 +152,6 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
         f" {actual.node} is mapped onto {_spell_connection(report.connection)} and must be onto"
         f" {_spell_connection(wanted)}",
     )
-
-
-def _as_planned(reported: Sequence[str], planned: Sequence[str], *, first_port: int) -> bool:
-    """Whether URLs mean the same, or what a node has after a restart."""
-    was, now = _meant(planned), _meant(reported)
-    if len(was) != len(now):
-        return False
-    return all(
-        old == new
-        or (
-            isinstance(old, ConnectionUrl)
-            and isinstance(new, ConnectionUrl)
-            and is_restarted_url(str(old), str(new), first_port=first_port)
-        )
-        for old, new in zip(was, now, strict=True)
-    )
-
-
-def _meant(urls: Sequence[str]) -> tuple[ConnectionUrl | str, ...]:
-    """Return what URLs mean: one URL may be written in several ways."""
-    return tuple(_read(each) for each in urls)
-
-
-def _read(url: str) -> ConnectionUrl | str:
-    try:
-        return parse(url)
-    except ConnectionUrlError:
-        return url
 
 
 def _spell_connection(connection: str) -> str:

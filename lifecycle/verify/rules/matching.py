@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
 from lifecycle.manifest.qos import Certainty, incompatibilities
+from lifecycle.printable import listed
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -174,20 +175,15 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
     if not flows:
         return
     names = [each.subject for each in flows]
-    listed = ", ".join(names[:_NAMED]) + (
-        f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
-    )
     yield UNREPORTED_FLOW.finding(
         subject=names[0] if len(names) == 1 else f"{len(names)} flows",
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
         observed="no report",
-        message=f"nothing proves that data can flow: neither end reports anything: {listed}",
+        message=f"nothing proves that data can flow: neither end reports anything: "
+        f"{listed(names, 6)}",
         at=flows[0].at,
     )
-
-
-_NAMED = 6
 
 
 def is_unreported(flow: FlowView) -> bool:

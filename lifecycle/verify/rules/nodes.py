@@ -7,6 +7,7 @@ it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
@@ -133,11 +134,9 @@ def _renames(process: PlannedProcess) -> bool:
 
 
 def _duplicate(view: View) -> Iterator[Finding]:
-    identities: dict[str, int] = {}
-    for configuration in view.reported:
-        identities[configuration.name] = identities.get(configuration.name, 0) + 1
+    identities = Counter(each.name for each in view.reported)
     for name, observed in view.observed.items():
-        count = max(observed.count, identities.get(name, 0))
+        count = max(observed.count, identities[name])
         if count < 2:
             continue
         node = view.planned.get(name)
