@@ -48,6 +48,12 @@ def count(number: int, noun: str) -> str:
     return f"{number} {noun}{ending}"
 
 
+def listed(names: Sequence[str], most: int) -> str:
+    """Return names in one line, at most so many of them: `/a, /b and 3 more`."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 _GAP = "  "
 _LEAST = 24
 """Columns that the last cell keeps even when the others are wide."""

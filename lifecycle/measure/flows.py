@@ -96,11 +96,8 @@ def judge(
 ) -> Judgement:
     """Judge a bound by what a subscription has counted.
 
-    Args:
-        bound: what is declared.
-        sample: of the subscription.
-        publishes_s: for how long its publisher has been let publish, seconds; None if not known.
-        clock: of its publisher's host; None if not known.
+    `publishes_s` is for how long its publisher has been let publish, seconds, and `clock` that of
+    its publisher's host; each is None if it is not known.
     """
     if bound.kind is Kind.DELAY:
         return _delay(bound, sample, sample.used, clock)
@@ -155,12 +152,9 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
 def too_many(messages: int, share: float) -> int:
     """Return how many late or lost messages are no chance any more, where a share of all may be.
 
-    Were each one with that probability, so many would be in 1 % of samples at most. The normal
-    approximation of the binomial distribution, and 2 more because that is skewed.
-
-    Args:
-        messages: > 0, of the sample; that all are is never chance.
-        share: > 0 and < 1.
+    Were each one with that probability, so many would be in 1 % of samples at most: the normal
+    approximation of the binomial distribution, and 2 more because that is skewed. That all of the
+    messages are is never chance.
     """
     expected = messages * share
     spread = math.sqrt(expected * (1 - share))

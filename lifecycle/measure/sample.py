@@ -95,13 +95,10 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
         return sum(number for _, number in self.buckets)
 
     def quantile_ms(self, quantile: float) -> float | None:
-        """Return the delay, milliseconds, that a share of the messages does not exceed.
+        """Return the delay, milliseconds, that a share of the messages, 0.99, does not exceed.
 
         By nearest rank; the largest of several delays is left out, because one late message is no
         quantile. None without messages.
-
-        Args:
-            quantile: > 0 and < 1, 0.99 for p99.
         """
         messages = self.messages
         if messages == 0:

@@ -1,10 +1,8 @@
 """Build the plan of a manifest: start order (`after:`), processes, flows, participants, discovery.
 
 Owns: `build_plan`, which puts the parts of this package together, and `check_plan`, which only
-reports whether that can be done; `dependency_levels`, the longest-path layering of the `after:`
-graph; which publisher → subscription pairs a system has, and what `links:` demand of them; grouping
-nodes into operating system processes, their argv and environment. Nothing here starts anything.
-Pure but for the environment, for finding executables and for reading parameter files.
+reports whether that can be done. Nothing here starts anything. Pure but for the environment, for
+finding executables and for reading parameter files.
 """
 
 from __future__ import annotations
@@ -61,6 +59,7 @@ from lifecycle.plan.parameters import NodeParameters, portable
 from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
 from lifecycle.plan.wiring import variables_of, wire
+from lifecycle.printable import listed
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
@@ -146,8 +145,7 @@ def build_plan(
 
     Args:
         manifest: valid, as `lifecycle.manifest.loading` returns it.
-        environment: variables to read ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE,
-            RMW_IMPLEMENTATION and AMENT_PREFIX_PATH from; None takes this process's own.
+        environment: None takes this process's own.
         domain_id: 0–232, in the place of the manifest's; None leaves that.
 
     Raises:
@@ -197,12 +195,8 @@ def with_files_of_now(plan: Plan) -> Plan:
 def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
     """Return a plan that starts all but some nodes: it waits for those, as for attached ones.
 
-    Args:
-        plan: of the whole system.
-        names: keys or fully qualified names.
-
     Raises:
-        UsageError: no such node, or another one of its process is not named.
+        UsageError: no node has this key or full name, or another one of its process is not named.
     """
     chosen = {find_node(plan, name).key for name in names}
     for process in plan.processes:
@@ -291,18 +285,14 @@ def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[D
         if each.name == SIM_TIME and each.value is True
     ]
     if users:
-        names = ", ".join(node.key for node, _ in users[:_NAMED])
-        more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
+        names = listed([node.key for node, _ in users], 4)
         yield warning(
             "check.no-clock",
             users[0][1].at,
-            f"cannot tell who gives {names}{more} simulated time: no node declares a publisher of"
+            f"cannot tell who gives {names} simulated time: no node declares a publisher of"
             " '/clock'",
             "declare it in the simulator's node, or start what publishes it before",
         )
-
-
-_NAMED = 4
 
 
 def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodeParameters) -> Plan:

@@ -1,16 +1,10 @@
 """Compare two plans of one system: differences, checksum, notice, and what a change does.
 
-Owns: `changes` and `plan_checksum`; `PlanChange` and `change_between`: which difference reaches a
-node's process, so that it has to be started again, which is a parameter that may be set while it
-runs, and which is only judged by; `PlanNotice`, what a supervisor announces of its plan, its text
-on the wire with bounds in both directions, and `concerns`: whose plan has to be the same as ours.
-Pure.
-
 Compared is what manifests declare, after includes and arguments: not where it is written, nor what
 follows from the host that planned it (folders, environment, installed types and executables), so
 that every host of a system computes the same checksum from the same manifest. The order of entries
 counts where the manifest gives it a meaning: in a command line and among parameter files, and for
-nodes where ports are given out in their order.
+nodes where ports are given out in their order. Pure.
 """
 
 from __future__ import annotations
@@ -381,10 +375,9 @@ def decode(text: str) -> PlanNotice:
 def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:
     """Whether the supervisor of a notice must have planned the same as we.
 
-    Two systems may share a domain and their hosts, and even a name where each has machines of its
-    own. But our system has one supervisor per machine, and a domain one node of a name: who runs
-    another machine of our system is concerned, and who plans a node that we plan. `own` are the
-    machines whose nodes we bring up.
+    It runs another machine of our system, or plans a node that we plan: a domain has one node of a
+    name. Other systems may share the domain, the hosts, and even the name. `own` are the machines
+    whose nodes we bring up.
     """
     theirs = {each.machine for each in plan.nodes} - own - {""}
     if notice.system == plan.system and not theirs.isdisjoint(notice.machines):
@@ -458,12 +451,7 @@ def change_between(running: Plan, plan: Plan, *, modes: tuple[str, str] = ("", "
     """Return what has to be done so that a system that runs by one plan runs by the other.
 
     A process is started again as a whole, and a component with its container. What others run
-    (`attach`) is only judged by.
-
-    Args:
-        running: of the manifest in force.
-        plan: of the other one.
-        modes: that the system is in now, and then; empty for a plan without.
+    (`attach`) is only judged by. `modes`: that the system is in now, and then; empty without.
     """
     old = {each.key: each for each in in_mode(running, modes[0]).nodes}
     new = {each.key: each for each in in_mode(plan, modes[1]).nodes}

@@ -1,13 +1,10 @@
 """How participants find each other: hosts, ports that are given out, the control plane.
 
-Owns: `Hosts`, `PortPool`; `Contact`, where a participant's discovery is reached, read out of
-connection URLs; what `discovery:` results in: the transport of the control plane, the discovery
-server, and for every own participant of a node the connection URLs with ports that are given out in
-a fixed order, so that equal plans have equal ports (observers first, then processes, then extra
-participants); and `connect_observers`, so that supervisors' own participants see what they must
-judge. An observer is on the control plane like the nodes' own participants; for connections by
-other transports it gets those as well, as far as one participant can have them: where ports are
-fixed, not shared memory beside UDP. Pure.
+Ports are given out in a fixed order, so that equal plans have equal ports: observers, which are
+supervisors' own participants, first, then processes, then extra participants. An observer is on the
+control plane like the nodes' own participants; for connections by other transports it gets those as
+well, as far as one participant can have them: where ports are fixed, not shared memory beside UDP.
+Machines of one address are one host, and so are those without one, which mean this host. Pure.
 """
 
 from __future__ import annotations
@@ -101,12 +98,7 @@ class Hosts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PortPool:
-    """Ports that are still free on each host, UDP and TCP alike.
-
-    Args:
-        first: the lowest that is given out, 1–65535.
-        taken: by host, what is not given out.
-    """
+    """Ports, 1–65535, that are still free on each host, UDP and TCP alike."""
 
     def __init__(self, first: int, taken: Mapping[str, Iterable[int]] | None = None) -> None:
         self._first = first
@@ -236,11 +228,8 @@ def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
 
     A router does not pass multicast. Where discovery finds any participant, beyond this host, the
     addresses of `machines:` are as good as ROS_STATIC_PEERS; other modes have their own peers.
-    IPv6 hosts are found by multicast only: rmw_fastrtps resolves no IPv6 address of a peer.
-
-    Args:
-        plan: the system.
-        own: machines that are this host.
+    IPv6 hosts are found by multicast only: rmw_fastrtps resolves no IPv6 address of a peer. `own`
+    are the machines that are this host.
 
     Returns:
         By IPv4 address, how many participants may be there: the supervisor, each process, each
@@ -311,9 +300,6 @@ def connect_control(
 
     A participant of a declared connection has its URLs already and is left alone, and so are all
     extra ones where endpoints are static: they carry data and become connections (`place_static`).
-
-    Returns:
-        The nodes with `connections` filled in, and what the rest of the plan must know.
 
     Raises:
         PlanError: a host has no address, or too few ports.

@@ -14,8 +14,7 @@ The first rule that applies decides; what both ends cannot have is a problem wit
     not be lost and are more than one datagram; else what is there anyway, UDP, TCP.
 
 An end that asked for something else than what was chosen, where no link decides, is a problem.
-
-Owns: `carried`, what Fast DDS does with two participants, and `choose`, these rules. Pure.
+Pure.
 """
 
 from __future__ import annotations
@@ -99,16 +98,6 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
             problem=f"cannot carry {self.writer.resolved!r} from {one!r} to {other!r}{how}: {why}",
             hint=hint,
         )
-
-
-def is_inside(flow: NegotiatedFlow) -> bool:
-    """Return whether a flow is handed over inside a process."""
-    return flow.medium == Medium.INTRAPROCESS
-
-
-def is_by_group(flow: NegotiatedFlow) -> bool:
-    """Return whether one datagram of a flow goes to a group."""
-    return flow.medium == Medium.UDPM
 
 
 MEETING = Medium.SHM

@@ -1,10 +1,9 @@
 """Negotiate transports and connections: node configurations, placement, hints → data layer graph.
 
-Owns: `negotiate`, which has a medium chosen for every publisher → subscription pair (`media`), and
-gives a node a connection only where its own participant would not carry the data anyway; and
-`connections_of`, as few connections as carry the endpoints that leave it. What exists already keeps
-its name and, while its transports are the same, its URLs. Deterministic, and independent of the
-order of the parties: equal systems have equal names, ports and groups. Pure.
+A node gets a connection only where its own participant would not carry the data anyway, and as few
+as carry its endpoints. What exists already keeps its name and, while its transports are the same,
+its URLs. Deterministic, and independent of the order of the parties: equal systems have equal
+names, ports and groups. Pure.
 """
 
 from __future__ import annotations
@@ -21,15 +20,7 @@ from lifecycle.manifest.names import free_name
 from lifecycle.network.connection_url import ConnectionUrl, parse
 from lifecycle.network.medium import CONNECTABLE, LOOPBACK, UDP_UNICAST, Medium, medium_of
 from lifecycle.plan.discovery import Contact, PortPool, contacts_of, fixed_url, peers_by, ports_of
-from lifecycle.plan.media import (
-    MEETING,
-    Pair,
-    carried,
-    choose,
-    discover,
-    is_by_group,
-    is_inside,
-)
+from lifecycle.plan.media import MEETING, Pair, carried, choose, discover
 from lifecycle.plan.model import PlanError, PlannedEndpoint
 from lifecycle.plan.parties import (
     DataLayerGraph,
@@ -54,14 +45,8 @@ def negotiate(
     """Choose how data get from every publisher to every subscription of its topic.
 
     The rules are in `media.py`. What cannot be made is a problem; everything else is negotiated all
-    the same.
-
-    Args:
-        parties: nodes with their endpoints, in any order.
-        wishes: what links demand.
-        terms: what the system gives.
-        before: what is there already: connections that still fit keep their names, ports, groups
-            and URLs, so that little is made anew.
+    the same. Of what is there `before`, connections that still fit keep their names, ports, groups
+    and URLs, so that little is made anew.
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
     chosen = _choices(pairs, terms)
@@ -119,7 +104,7 @@ def _choices(pairs: Sequence[Pair], terms: Terms) -> list[NegotiatedFlow]:
                 listeners=len(listeners.get(writer, ())),
                 max_datagram_bytes=terms.max_datagram_bytes,
             )
-            if is_by_group(found[index]):
+            if found[index].medium == Medium.UDPM:
                 by_group.add(writer)
     return [found[index] for index in range(len(pairs))]
 
@@ -146,31 +131,23 @@ class _Carriers:
         self._needs: dict[End, set[str]] = {}
         for pair, flow in chosen:
             # A topic has a group of its own.
-            token = f"{flow.medium}@{flow.topic}" if is_by_group(flow) else flow.medium
+            token = f"{flow.medium}@{flow.topic}" if flow.medium == Medium.UDPM else flow.medium
             sides = ((pair.publisher, pair.writer), (pair.subscription, pair.reader))
             for end, side in zip(pair.ends, sides, strict=True):
                 self._sides[end] = side
-                self._needs.setdefault(end, set()).update(() if is_inside(flow) else (token,))
+                self._needs.setdefault(end, set()).update(
+                    () if flow.medium == Medium.INTRAPROCESS else (token,)
+                )
 
     def settle(self) -> tuple[list[NegotiatedFlow], list[NegotiatedFlow]]:
         """Move endpoints until every pair has its medium; return flows, and what has it not."""
-        stuck: set[int] = set()
-        changed = True
+        # A pair that held may not do so any more after others have moved.
+        changed = 1
         while changed:
-            changed = False
-            for index, (pair, flow) in enumerate(self._chosen):
-                if index in stuck or self._holds(pair, flow):
-                    continue
-                if self._move(pair, flow):
-                    changed = True
-                else:
-                    stuck.add(index)
+            changed = sum(self._move(*each) for each in self._chosen if not self._holds(*each))
         flows, problems = [], []
-        # A pair that was stuck, or held, may not be so any more after others have moved.
-        for index, (pair, flow) in enumerate(self._chosen):
+        for pair, flow in self._chosen:
             flows.append(flow)
-            if not self._moved and index not in stuck:
-                continue  # it held, and nothing has changed since
             impossible = any(map(self._is_impossible, pair.ends))
             if self._holds(pair, flow) and not impossible:
                 continue
@@ -221,7 +198,7 @@ class _Carriers:
     def _holds(self, pair: Pair, flow: NegotiatedFlow) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        if is_inside(flow):
+        if flow.medium == Medium.INTRAPROCESS:
             return bool(present)
         meet = self._served or not pair.same_host or discover(*map(self._transports, pair.ends))
         return present == [flow.medium] and meet
@@ -231,7 +208,7 @@ class _Carriers:
             return True
         for end in pair.ends:
             if end in self._moved:
-                if is_inside(flow) and MEETING not in self._moved[end]:
+                if flow.medium == Medium.INTRAPROCESS and MEETING not in self._moved[end]:
                     self._moved[end].add(MEETING)
                     return True
                 continue
@@ -303,30 +280,25 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
         alone = self.endpoint.kind is EndpointKind.PUBLISHER and self.endpoint.unique.asks
         return self.label if alone else ""
 
-
-class _Draft(msgspec.Struct, frozen=True, kw_only=True):
-    """A connection that has no URLs yet; `topic` is that of its group, empty without."""
-
-    party: Party
-    name: str
-    transports: tuple[str, ...]
-    members: tuple[Moved, ...]
-
-    @property
-    def key(self) -> tuple[str, str]:
-        return self.party.key, self.name
-
     @property
     def media(self) -> list[Medium]:
+        """What its connection has."""
         plain = {each.partition("@")[0] for each in self.transports}
         return [each for each in Medium if each in plain]
 
     @property
-    def topic(self) -> str:
+    def group(self) -> str:
+        """The topic of the group of its connection; empty without."""
         return next((each.partition("@")[2] for each in self.transports if "@" in each), "")
 
 
-_Urls = Mapping[tuple[str, str], tuple[ConnectionUrl, ...]]
+_Place = tuple[str, str]
+"""A connection: key of its party, and its name."""
+
+_Drafts = Mapping[_Place, Sequence[Moved]]
+"""What each connection carries: all of one party, with the same transports; sorted."""
+
+_Urls = Mapping[_Place, tuple[ConnectionUrl, ...]]
 
 
 def connections_of(
@@ -344,26 +316,58 @@ def connections_of(
     drafts = _drafts(moved)
     old = {(each.node, each.name): each for each in before.connections} if before else {}
     kept: _Urls = {
-        draft.key: tuple(map(parse, old[draft.key].urls))
-        for draft in drafts
-        if draft.key in old
-        and {text.partition(":")[0] for text in old[draft.key].urls} == {*draft.media}
+        place: tuple(map(parse, old[place].urls))
+        for place, (first, *_) in drafts.items()
+        if place in old and {text.partition(":")[0] for text in old[place].urls} == {*first.media}
     }
     bare: _Urls = {**kept, **_with_ports(drafts, kept, terms)}
+    carriers = {each.end: place for place, members in drafts.items() for each in members}
+    own_contacts = {each.key: each.contacts for each in parties}
+
+    def contacts(place: _Place) -> Iterator[Contact]:
+        """Yield observers, and those whom the connection exchanges data with.
+
+        Of two that are new the subscribing one looks for the other, so that one TCP connection is
+        made and not two; of a new one and one that is there, the new one does.
+        """
+        yield from terms.observers
+        for member in drafts[place]:
+            publishes = member.endpoint.kind is EndpointKind.PUBLISHER
+            for partner in member.partners:
+                other = carriers.get(partner)
+                if other is None:
+                    yield from own_contacts[partner[0]]
+                elif other != place and (not publishes or other in kept):
+                    yield from contacts_of(drafts[other][0].party.host, map(str, bare[other]))
+
+    def looking(url: ConnectionUrl, found: Iterable[Contact], host: str) -> ConnectionUrl:
+        if terms.server is not None:
+            served = url.transport is terms.server_medium
+            return replace(url, server=(terms.server,) if served else ())
+        if url.transport.is_network and (terms.fixed or url.transport.is_tcp):
+            return replace(url, peers=peers_by(url.transport, found, host=host))
+        return url
+
+    def urls(place: _Place) -> tuple[str, ...]:
+        if place in kept:
+            return old[place].urls
+        found, host = tuple(contacts(place)), drafts[place][0].party.host
+        return tuple(str(looking(url, found, host)) for url in bare[place])
+
     return tuple(
         NegotiatedConnection(
-            node=draft.party.key,
-            name=draft.name,
-            urls=old[draft.key].urls if draft.key in kept else urls,
-            map=tuple(sorted(each.label for each in draft.members)),
-            reason=f"{', '.join(dict.fromkeys(each.endpoint.resolved for each in draft.members))} "
-            f"by {' and '.join(draft.media)}",
+            node=place[0],
+            name=place[1],
+            urls=urls(place),
+            map=tuple(sorted(each.label for each in members)),
+            reason=f"{', '.join(dict.fromkeys(each.endpoint.resolved for each in members))} "
+            f"by {' and '.join(members[0].media)}",
         )
-        for draft, urls in _with_peers(drafts, bare, kept, parties, terms)
+        for place, members in drafts.items()
     )
 
 
-def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
+def _drafts(moved: Sequence[Moved]) -> _Drafts:
     """Group endpoints that may share a participant, and name each group by what it is.
 
     Names are `tcpv4`, `udpm_tcpv4_video`, `udpv4_publishers_video`.
@@ -372,37 +376,36 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
     for each in moved:
         place = (each.party.key, each.transports, each.endpoint.participant, each.alone)
         groups.setdefault(place, []).append(each)
-    drafts = []
-    taken: dict[str, set[str]] = {}
-    for (key, transports, group, alone), members in sorted(groups.items()):
-        party = members[0].party
-        draft = _Draft(party=party, name="", transports=transports, members=tuple(members))
-        words = [*map(str, draft.media)]
+    drafts: dict[_Place, list[Moved]] = {}
+    for (key, _, participant, alone), members in sorted(groups.items()):
+        words = [*map(str, members[0].media)]
         words += [
-            _NOT_WORD.sub("_", each).strip("_") for each in (draft.topic, group, alone) if each
+            _NOT_WORD.sub("_", each).strip("_")
+            for each in (members[0].group, participant, alone)
+            if each
         ]
-        names = taken.setdefault(key, {each.connection for each in party.participants})
-        name = free_name("_".join(words), names)
-        names.add(name)
-        drafts.append(replace(draft, name=name))
-    return sorted(drafts, key=lambda each: each.key)
+        taken = {each.connection for each in members[0].party.participants}
+        taken |= {name for node, name in drafts if node == key}
+        drafts[key, free_name("_".join(words), taken)] = members
+    return dict(sorted(drafts.items()))
 
 
-def _with_ports(drafts: Sequence[_Draft], kept: _Urls, terms: Terms) -> _Urls:
+def _with_ports(drafts: _Drafts, kept: _Urls, terms: Terms) -> _Urls:
     """Return the URLs of new connections with ports and groups of their own, without peers."""
     pool = PortPool(terms.first_port, terms.taken)
-    hosts = sorted({each.party.host for each in drafts})
+    firsts = {place: members[0] for place, members in drafts.items()}
+    hosts = sorted({each.party.host for each in firsts.values()})
     groups: dict[str, ConnectionUrl] = {}
-    for draft in drafts:
-        for url in kept.get(draft.key, ()):
-            for port in ports_of([url]):
-                pool.reserve((draft.party.host,), port)
+    for place, urls in kept.items():
+        for port in ports_of(urls):
+            pool.reserve((firsts[place].party.host,), port)
+        for url in urls:
             if url.transport.is_group:
-                groups.setdefault(draft.topic, url)
+                groups.setdefault(firsts[place].group, url)
     for url in groups.values():
         if url.port is not None:
             pool.reserve(hosts, url.port)
-    for topic in sorted({each.topic for each in drafts} - {"", *groups}):
+    for topic in sorted({each.group for each in firsts.values()} - {"", *groups}):
         groups[topic] = ConnectionUrl(
             transport=Medium.UDPM,
             address=_new_group({url.address for url in groups.values()}, terms.multicast_group),
@@ -411,9 +414,9 @@ def _with_ports(drafts: Sequence[_Draft], kept: _Urls, terms: Terms) -> _Urls:
             interfaces=(LOOPBACK,),
         )
     return {
-        draft.key: tuple(_bare(draft, groups.get(draft.topic), pool, terms))
-        for draft in drafts
-        if draft.key not in kept
+        place: tuple(_bare(first, groups.get(first.group), pool, terms))
+        for place, first in firsts.items()
+        if place not in kept
     }
 
 
@@ -433,10 +436,10 @@ def _new_group(used: set[str], lowest: str) -> str:
 
 
 def _bare(
-    draft: _Draft, group: ConnectionUrl | None, pool: PortPool, terms: Terms
+    first: Moved, group: ConnectionUrl | None, pool: PortPool, terms: Terms
 ) -> Iterator[ConnectionUrl]:
-    host = draft.party.host
-    for transport in draft.media:
+    host = first.party.host
+    for transport in first.media:
         other_version = (":" in host) != (transport.ip_version == 6)
         address = transport.loopback if other_version else host or transport.loopback
         if not transport.is_network:
@@ -454,43 +457,5 @@ def _bare(
             # Each sample would go twice to IPv6's global and link-local addresses.
             own = host if transport.ip_version == 6 and ":" in host else ""
             yield ConnectionUrl(transport=transport, address=own)
-    if terms.server is not None and terms.server_medium not in draft.media:
+    if terms.server is not None and terms.server_medium not in first.media:
         yield ConnectionUrl(transport=terms.server_medium)
-
-
-def _with_peers(
-    drafts: Sequence[_Draft], bare: _Urls, kept: _Urls, parties: Sequence[Party], terms: Terms
-) -> Iterator[tuple[_Draft, tuple[str, ...]]]:
-    """Yield each connection with its URLs: what it looks for is in them."""
-    carrier = {member.end: draft for draft in drafts for member in draft.members}
-    own_contacts = {each.key: each.contacts for each in parties}
-
-    def contacts(draft: _Draft) -> Iterator[Contact]:
-        """Yield observers, and those whom the connection exchanges data with.
-
-        Of two that are new the subscribing one looks for the other, so that one TCP connection is
-        made and not two; of a new one and one that is there, the new one does.
-        """
-        yield from terms.observers
-        for member in draft.members:
-            publishes = member.endpoint.kind is EndpointKind.PUBLISHER
-            for partner in member.partners:
-                other = carrier.get(partner)
-                if other is None:
-                    yield from own_contacts[partner[0]]
-                elif other is not draft and (not publishes or other.key in kept):
-                    yield from contacts_of(other.party.host, map(str, bare[other.key]))
-
-    def looking(url: ConnectionUrl, found: Iterable[Contact], host: str) -> ConnectionUrl:
-        if terms.server is not None:
-            served = url.transport is terms.server_medium
-            return replace(url, server=(terms.server,) if served else ())
-        if url.transport.is_network and (terms.fixed or url.transport.is_tcp):
-            peers = peers_by(url.transport, found, host=host)
-            return replace(url, peers=peers)
-        return url
-
-    for draft in drafts:
-        found = () if draft.key in kept else tuple(contacts(draft))
-        urls = (looking(url, found, draft.party.host) for url in bare[draft.key])
-        yield draft, tuple(map(str, urls))

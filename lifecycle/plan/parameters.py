@@ -1,8 +1,5 @@
 """Expected parameter values of a node: declared parameters with the values that override them.
 
-Owns: from the manifest's sources of values to `ExpectedParameter`, and the one spelling of
-values that are compared. Reads parameter files, whose layout the checks know.
-
 Values are taken, weakest first, from a declaration's default, what a `command:` itself sets after
 `--ros-args`, the parameter files, and `parameters:`. Among the sections of files rcl has an order
 of its own (measured, rclpy 7.1): sections of one name are one, at the place of the first of them,
@@ -156,8 +153,7 @@ def _expected(name: str, type_: str, given: _Given) -> ExpectedParameter:
 
 def as_type(value: ParameterValue, type_: str) -> ParameterValue:
     """Return `value` as a parameter of `type_` has it: YAML writes 5 where a double is meant."""
-    one = type_.removesuffix("_array")
-    if one != "double":
+    if type_.removesuffix("_array") != "double":
         return value
     if isinstance(value, tuple):
         return tuple(float(each) if _is_int(each) else each for each in value)

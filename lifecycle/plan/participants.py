@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from lifecycle.manifest.flows import ParticipantGroup
-from lifecycle.manifest.model import (
-    ConnectionDeclaration,
-)
+from lifecycle.manifest.model import ConnectionDeclaration
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import (
     ParticipantConnections,
@@ -40,10 +38,8 @@ def place(
     """Put endpoints on the connections that are declared for them, the others on what flows need.
 
     Names of the latter count from 0 in the order in which the interface first needs them, so they
-    are the same in every run. What is in no connection and no group is left alone.
-
-    Returns:
-        The endpoints with `participant` filled in, and the participants, connections first.
+    are the same in every run. What is in no connection and no group is left alone. Returns the
+    endpoints with `participant` filled in, and the participants, connections first.
     """
     places = {
         entry: participant_name(node_name, connection.name)

@@ -11,12 +11,7 @@ from types import MappingProxyType
 
 import msgspec
 
-from lifecycle.manifest.model import (
-    DiscoveryMode,
-    EndpointKind,
-    FlowTransport,
-    RunKind,
-)
+from lifecycle.manifest.model import DiscoveryMode, EndpointKind, FlowTransport, RunKind
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import (
     BUILTIN_TRANSPORTS,
@@ -30,13 +25,7 @@ from lifecycle.network.medium import (
 )
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.discovery import Contact, Hosts, contacts_of, is_fixed, ports_of
-from lifecycle.plan.model import (
-    Plan,
-    PlannedEndpoint,
-    PlannedFlow,
-    PlannedNode,
-    PlannedParticipant,
-)
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode, PlannedParticipant
 
 End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""
@@ -186,13 +175,9 @@ _NO_VARIABLES: Mapping[str, str] = MappingProxyType({})
 def party_of_node(
     node: PlannedNode, hosts: Hosts, *, rmw: str, variables: Mapping[str, str] = _NO_VARIABLES
 ) -> Party:
-    """Return a node as a party, from what its manifest declares alone.
+    """Return a node without negotiated participants as a party, from its manifest alone.
 
-    Args:
-        node: without negotiated participants.
-        hosts: of the system.
-        rmw: the RMW identifier that it runs with.
-        variables: what a COMMAND node's process gets beside its own.
+    `variables` are what a COMMAND node's process gets beside its own.
     """
     host = hosts.host(node.machine)
     known = rmw.startswith(FAST_DDS)

@@ -1,8 +1,7 @@
 """Operating system processes: which nodes share one, command lines, environment, secrets in it.
 
-Owns: `planned_processes`; finding executables where types are found; and which environment
-variables hold secrets, by their names: whatever leaves the supervisor and the processes that it
-starts, on a terminal, on disk or on the network, is redacted here. Starts nothing.
+Whatever leaves the supervisor and the processes that it starts, on a terminal, on disk or on the
+network, is redacted here. Starts nothing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Find what nodes run without running it: executables, packages, Python classes, handlers.
 
-Owns: `resolve_programs`, a stage of its own between a valid manifest and its plan, because what it
-finds depends on the host. It looks where `up` would: PATH of the node's environment, the working
-directory, AMENT_PREFIX_PATH, the modules of this interpreter. What Python or exec(3) would refuse
-is an error; what only running it, or another host, can show is named as unresolved.
+It looks where `up` would: PATH of the node's environment, the working directory, AMENT_PREFIX_PATH,
+the modules of this interpreter. What Python or exec(3) would refuse is an error; what only running
+it, or another host, can show is named as unresolved.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Read Python node classes from their source: bases, handlers, constructor; imports nothing.
 
-Owns: `Sources`, which finds the file of `module:Class` and reads the class there and its bases,
-through plain imports. It ends in two other ways: `NotThereError`, what Python itself would refuse,
-and `UnknownError`, what only running the code can show (star imports, names made by assignments
-or under conditions, classes that are decorated). Reads files; runs nothing.
+`NotThereError` is what Python itself would refuse, `UnknownError` what only running the code can
+show (star imports, names made by assignments or under conditions, classes that are decorated).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Print a plan as text: what `lifecycle plan` shows.
-
-Owns: that text. JSON is written by `lifecycle.codec`, pictures by export/. Pure.
-"""
+"""Print a plan as text: what `lifecycle plan` shows. Pure."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Restart nodes while others keep running: new TCP ports and peers for their participants.
-
-Owns: `restarted`, `moved_observer`, `moving_nodes` and `is_restarted_url`. Pure.
+"""Restart nodes while others keep running: new TCP ports and peers for their participants. Pure.
 
 Fast DDS 2.14 keeps an accepted TCP connection under the listening port that its dialler names, also
 once that one is gone, and takes no other in its place: a participant that returns on the same port
@@ -16,7 +14,7 @@ from types import MappingProxyType
 
 from msgspec.structs import replace
 
-from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, parse
 from lifecycle.network.ports import MAX_PORT
 from lifecycle.plan.discovery import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
@@ -139,17 +137,19 @@ def moving_nodes(plan: Plan) -> frozenset[str]:
     )
 
 
-def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
-    """Whether a participant that was planned with one URL has the other because of a restart.
+def is_same_url(planned: str, reported: str, *, first_port: int) -> bool:
+    """Whether a participant that was planned with one URL has it, or the other since a restart.
 
     Another host's supervisor restarts its nodes without notice, and to an observing command so
     does ours. Which peers there were then cannot be known afterwards. `first_port` is the first of
     the ports that the plan gives out.
-
-    Raises:
-        ConnectionUrlError: one of them is none.
     """
-    was, now = parse(planned), parse(reported)
+    try:
+        was, now = parse(planned), parse(reported)
+    except ConnectionUrlError:
+        return planned == reported
+    if was == now:
+        return True
     if not was.transport.is_tcp or not _moves(was):
         return False
     if was.port is None or now.port is None or now.port < first_port + RESTART_PORTS_FROM:

@@ -1,14 +1,10 @@
-"""Wire a plan: connect participants, place endpoints on declared or negotiated connections.
+"""Wire a plan: connect participants, place endpoints on declared or negotiated connections. Pure.
 
-Owns: `wire`, in this order: ports that are written down are kept free, own participants and
-observers are connected, endpoints are negotiated for, observers are extended to see the result.
-Static endpoint discovery (Fast DDS STATIC EDP): the connection `data` that
-carries a node's topics in that mode, and the table of all endpoints: DDS names, ids that are unique
-in the system, and rmw_fastrtps's own topic `ros_discovery_info` of each participant. Pure.
-
-Also `infeasible`, what a wired plan asks of participants that they cannot do: services and actions
-whose two ends have no transport in common, marks and ports of their own where no UDP socket is. For
-topics `negotiate` finds the like; what is negotiated while the system runs is judged there.
+In this order: ports that are written down are kept free, own participants and observers are
+connected, endpoints are negotiated for, observers are extended to see the result. With static
+endpoint discovery (Fast DDS STATIC EDP) the connection `data` carries a node's topics, and a table
+has all endpoints: DDS names, ids that are unique in the system, and rmw_fastrtps's own topic
+`ros_discovery_info` of each participant.
 """
 
 from __future__ import annotations

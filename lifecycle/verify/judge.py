@@ -1,9 +1,7 @@
-"""Verifies a running ROS 2 system against its plan: Plan × Observation → Verdict.
+"""Verifies a running ROS 2 system against its plan: Plan × Observation → Verdict. Pure.
 
-Owns: `verify` and when a verdict closes the gate; one FlowReport per planned flow (what carries it,
-how unique it is, whether it is as declared); and the one-line summaries of what a verdict still
-waits for or accepts unverified: `missing`, `not_ok`, `taken_on_trust`. Everything it needs is in
-its arguments. Pure.
+Also one FlowReport per planned flow, and the one-line summaries of what a verdict still waits for
+or accepts unverified.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Matches declared endpoints with those observed in the ROS graph and in node reports.
 
-Owns: `lay_out`: which observed endpoint and which report belong to which declared endpoint, and
-what is left over. All rules read the result, so that they agree on what is the same thing. Pure.
+All rules read the result, so that they agree on what is the same thing. Pure.
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ from lifecycle.verify.view import (
     SeenEndpoint,
     View,
     actual_qos,
-    declared_addresses,
     is_beyond,
     may_hide,
 )
@@ -67,16 +65,7 @@ def lay_out(
     ahead: frozenset[str] = frozenset(),
     over: Mapping[str, str] | None = None,
 ) -> View:
-    """Match everything observed to everything planned; deterministic for any input order.
-
-    Args:
-        plan: what must be.
-        observation: what was seen.
-        stage: which moment it is judged against.
-        machines: as `View` has them, and `ahead`, and `over`.
-        ahead: see there.
-        over: see there.
-    """
+    """Match everything observed to everything planned; deterministic for any input order."""
     planned = {node.full_name: node for node in plan.nodes}
     names = DeclaredNames.of(plan)
     reported = _by_identity(observation)
@@ -131,7 +120,9 @@ def lay_out(
         seen=_seen(groups, actual, tools),
         seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
         flows=_flows(plan, nodes),
-        uniqueness=Uniqueness(reported, declared_addresses(plan)),
+        uniqueness=Uniqueness(
+            reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
+        ),
         measured=observation.measured,
         clocks=None if observation.clocks is None else dict(observation.clocks),
         marks={(each.machine, each.dscp): each.arrives_as for each in observation.marks},
@@ -139,10 +130,8 @@ def lay_out(
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
-    by_name = sorted(observation.configurations, key=lambda each: each.name)
-    if all(one.name != other.name for one, other in itertools.pairwise(by_name)):
-        return tuple(by_name)
-    return tuple(sorted(by_name, key=lambda each: (each.name, repr(each.identity))))
+    found = observation.configurations
+    return tuple(sorted(found, key=lambda each: (each.name, repr(each.identity))))
 
 
 def _attributed(
@@ -155,10 +144,7 @@ def _attributed(
 
     Services have no GID of their own in reports: one whose node is not known is that of the node on
     its participant that declares it. What client libraries bring along is left out here, unless it
-    is declared; under a declared name, unless it is a declared node's.
-
-    Returns:
-        The endpoints by the name of the node whose they are, sorted by it.
+    is declared; under a declared name, unless it is a declared node's. By node name, sorted.
     """
     hidden = owners(names.nodes, reported)
     shown: dict[str, list[ObservedEndpoint]] = {}
@@ -242,8 +228,7 @@ def _tools(
 def _by_place(matched: Iterable[Actual]) -> dict[tuple[EndpointKind, str], tuple[Actual, ...]]:
     ends: dict[tuple[EndpointKind, str], tuple[Actual, ...]] = {}
     for each in matched:
-        place = (each.planned.kind, each.planned.resolved)
-        ends[place] = (*ends.get(place, ()), each)
+        ends[each.kind, each.name] = (*ends.get((each.kind, each.name), ()), each)
     return ends
 
 
@@ -286,15 +271,7 @@ def _match_node(
                 observed = _as_observed(node, report) if _is_there(report) else None
             if report is not None:
                 reports[_left_key(report)].remove(report)
-            matched[index] = Actual(
-                node=node,
-                planned=planned,
-                observed=observed,
-                report=report,
-                end=_end(node, planned, observed, report),
-                unseen=unseen,
-                beyond=beyond,
-            )
+            matched[index] = _actual(node, planned, observed, report, unseen=unseen, beyond=beyond)
     rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
     rest += [
         _as_observed(node, actual.report)
@@ -381,10 +358,7 @@ def _undeclared(
         for each in group
         if not each.kind.is_topic
     }
-    declared = {
-        (each.node.full_name, each.planned.kind, each.planned.resolved): each.planned.type
-        for each in actual
-    }
+    declared = {(each.node, each.kind, each.name): each.planned.type for each in actual}
 
     def is_half(endpoint: ObservedEndpoint) -> bool:
         action = action_part(endpoint.kind, endpoint.name)
@@ -415,28 +389,34 @@ def _graph_nodes(
     return merged
 
 
-def _end(
+def _actual(
     node: PlannedNode,
     planned: PlannedEndpoint,
     observed: ObservedEndpoint | None,
     report: EndpointReport | None,
-) -> SeenEndpoint:
+    *,
+    unseen: bool,
+    beyond: bool,
+) -> Actual:
     """Return a declared endpoint with all that is known of it."""
-    shown = observed.qos if observed else None
     type_hash = observed.type_hash if observed else None
     if not type_hash and report is not None and report.type_hash is not None:
         # Discovery wins where it knows a hash; with static discovery only the node itself does.
         type_hash = report.type_hash
-    return SeenEndpoint(
+    return Actual(
         kind=planned.kind,
         node=node.full_name,
         name=planned.resolved,
         type=observed.type if observed else planned.type,
-        qos=actual_qos(shown, report.qos if report else None),
+        qos=actual_qos(observed.qos if observed else None, report.qos if report else None),
         report=report,
         planned=planned,
         type_hash=type_hash,
-        observed=observed is not None or report is not None,
+        is_shown=observed is not None or report is not None,
+        owner=node,
+        observed=observed,
+        unseen=unseen,
+        beyond=beyond,
     )
 
 
@@ -446,17 +426,17 @@ def _seen(
     tools: Collection[str],
 ) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
-    topical = [each for each in actual if each.planned.kind.is_topic]
+    topical = [each for each in actual if each.kind.is_topic]
     # Not visible here, but the endpoints that match them count them.
-    found = [each.end for each in topical if each.beyond and each.observed is None]
-    declared = {id(each.observed): each.end for each in topical if each.observed is not None}
+    found: list[SeenEndpoint] = [each for each in topical if each.beyond and each.observed is None]
+    declared = {id(each.observed): each for each in topical if each.observed is not None}
     found += [
         declared.get(id(each)) or SeenEndpoint.of(each)
         for name, group in groups.items()
         if name not in tools
         for each in _topical(group)
     ]
-    found += [each.end for each in topical if each.unseen and each.observed is not None]
+    found += [each for each in topical if each.unseen and each.observed is not None]
     return tuple(found)
 
 

@@ -153,11 +153,6 @@ def meets(demanded: UniqueHow, *, publisher: bool | None, subscription: bool | N
 
     One end that is unique is enough for WEAKLY, whatever is not known of the other; one that is
     not is enough to fail STRONGLY.
-
-    Args:
-        demanded: what is asked; NOT is always met.
-        publisher: whether the publisher's NFEs are unique.
-        subscription: the same of the subscription.
     """
     ends = (publisher, subscription)
     if demanded is UniqueHow.NOT:
@@ -268,12 +263,6 @@ def carrier(
     subscription: Identity | None,
 ) -> str:
     """Return what carries the data from a publisher to a subscription.
-
-    Args:
-        source: the publisher's NFEs; empty when not known.
-        destination: the subscription's.
-        publisher: identity of the publishing node; None when not known.
-        subscription: likewise.
 
     Returns:
         `intraprocess`, `shm`, `udpm` if the destination listens at a group, or the first IP

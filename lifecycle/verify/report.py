@@ -1,19 +1,14 @@
 """Verification reports of a verdict: text, JUnit XML, SARIF 2.1.0, JSON and GitHub's annotations.
 
-Owns: layout and wording of the text (the findings' own sentences come from the rules); the JUnit
-test cases and their results; the SARIF log; the JSON document of schemas/verdict.v1.schema.json,
-and how findings are written in any JSON. Pure.
-
 JUnit, for continuous integration: names and number of the cases are always the same, so that
 reports can be compared case by case: one for the manifest, one for each rule, one for the end of
 the run. What refuses the system is a failure. What could not be verified and was allowed is in the
 case's system-out, as flows are in their suite's; a case is skipped only where nothing was judged,
 and then the end of the run fails.
 
-SARIF, for editors and code scanning (source of the format: OASIS SARIF 2.1.0): violated is an
-error, unverifiable a warning; a finding points at the declaration in the manifest. A run that was
-no success has at least one error; its rule is `run.end` where no finding is to blame, so that an
-unjudged system does not look good.
+SARIF, for editors and code scanning (OASIS SARIF 2.1.0): violated is an error, unverifiable a
+warning; a finding points at the declaration in the manifest. A run that was no success has at least
+one error; its rule is `run.end` where no finding is to blame. Pure.
 """
 
 from __future__ import annotations
@@ -294,16 +289,10 @@ def to_github(verdict: Verdict, *, strict: bool = False) -> str:
 
 
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
-    """Write `{"verdict": …, "findings": [...], "flows": [...]}`.
+    """Write `{"verdict": …, "findings": [...], "flows": [...]}` and what else there is.
 
-    There are `open_endpoints`, `tolerated` and `measured`, too, where there are any. The last
-    verdict of a run has `run`: why it ended, how far it came, its exit code, and what its gate took
-    on trust, if anything. Where no system was judged it has `"judged": false`, and its findings are
-    why.
-
-    Args:
-        verdict: what to write.
-        indent: spaces per level; None for one line.
+    The last verdict of a run has `run`. Where no system was judged it has `"judged": false`, and
+    its findings are why. `indent`: spaces per level; None for one line.
     """
     document: dict[str, object] = {
         "verdict": verdict.verdict.value,

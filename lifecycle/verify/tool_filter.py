@@ -1,9 +1,4 @@
-"""Filters tools and client library endpoints, which no manifest declares, out of a ROS graph.
-
-Owns: which nodes are tools; the endpoints that client libraries bring along; the folding of an
-action's hidden topics and services into action endpoints; which hidden node belongs to which
-planned node; and which names a plan declares, so that an unknown node's housekeeping is not taken
-for harmless under one of them. Data and predicates only. Pure.
+"""Filters tools and client library endpoints, which no manifest declares, out of a ROS graph. Pure.
 
 Sources: rcl (parameter, type description and logger services, rosout), rcl_lifecycle, the actions
 article (https://design.ros2.org/articles/actions.html), names of nodes as the tools choose them.
@@ -206,10 +201,7 @@ class DeclaredNames(msgspec.Struct, frozen=True):
     def keeps(self, endpoint: ObservedEndpoint, node: str, *, ours: bool) -> bool:
         """Return whether an endpoint is declared, feeds what is, or was made on purpose.
 
-        Args:
-            endpoint: as discovery shows it.
-            node: full name of the node whose it is.
-            ours: see `is_noise_endpoint`.
+        `node` is whose it is, by full name; `ours`: see `is_noise_endpoint`.
         """
         kind, name = endpoint.kind, endpoint.name
         return (
@@ -313,14 +305,10 @@ def _is_status(kind: EndpointKind, name: str) -> bool:
 def of_supervisors(
     plan: Plan, endpoints: Iterable[ObservedEndpoint]
 ) -> frozenset[ObservedEndpoint]:
-    """Return those endpoints that supervisors offer as policies allow, of this or another system.
+    """Return those endpoints of tools that supervisors offer as policies allow, of any system.
 
     A name proves nothing: who offers something below a supervisor's prefix is that supervisor if
     no other participant does, and what it publishes on /diagnostics is of that participant.
-
-    Args:
-        plan: of the system that is judged.
-        endpoints: of tools.
     """
     ours = supervisor_prefixes(plan)
     prefixes = {
@@ -375,15 +363,8 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     Offering such a service counts as noise only under the node's own name; using it, under any:
     who drives another node's lifecycle or parameters declares nothing. A topic or service of
     another type only has the name, and belongs to a user. An endpoint whose node is not known is
-    never noise: it may be the first sign of a node that must not be there.
-
-    Args:
-        kind: kind of the endpoint.
-        node: fully qualified name of the endpoint's node; empty while unknown.
-        name: fully qualified name of the topic, service or action.
-        type_: of the endpoint, `rcl_interfaces/srv/GetParameters`.
-        ours: the node is one of ours (`our_nodes`), so that the services of the node interface
-            are its own. Using those of others is noise from anywhere.
+    never noise: it may be the first sign of a node that must not be there. The services of the node
+    interface are noise of nodes that are `ours` (`our_nodes`); using those of others, of all.
     """
     if not node:
         return False
@@ -409,8 +390,7 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
 def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
     """Return the nodes that offer the node interface and the node configuration interface.
 
-    Args:
-        endpoints: all of the nodes in question; nothing left out as noise before.
+    Of the nodes in question no endpoint may have been left out as noise before.
     """
     offered: dict[str, set[str]] = {}
     for each in endpoints:
@@ -428,12 +408,8 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
 def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | None:
     """Return the action endpoint that a hidden topic or service is a part of.
 
-    Args:
-        kind: kind of the hidden endpoint.
-        name: its fully qualified name, `/dock/_action/send_goal`.
-
-    Returns:
-        ACTION_SERVER or ACTION_CLIENT and the action's name; None if it is no part of an action.
+    `/dock/_action/send_goal` gives ACTION_SERVER or ACTION_CLIENT, and `/dock`; None if it is no
+    part of an action.
     """
     action, separator, part = name.rpartition(_ACTION_PART)
     if not separator or not action:
@@ -500,12 +476,7 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
 
 
 def part_type(part: str, type_: str) -> str:
-    """Return the type that a part of an action must have.
-
-    Args:
-        part: a hidden name or the end of one, `/dock/_action/send_goal`.
-        type_: of the action, `robot/action/Dock`.
-    """
+    """Return the type that a part of an action has; the end of its name is enough."""
     _, end = _ACTION_PARTS[part.rpartition("/")[2]]
     return f"{type_}{end}" if end.startswith("_") else end
 
@@ -545,14 +516,10 @@ class Owner(msgspec.Struct, frozen=True):
 
 
 def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dict[str, Owner]:
-    """Return whose every hidden node is, by its full name.
+    """Return whose every hidden node of planned nodes is, by its full name.
 
     A name proves nothing: any process can call a node `_camera_flow_0`. Only the node that has it
     can say so, and on which participant it is.
-
-    Args:
-        nodes: full names of the planned ones.
-        reported: what nodes report of themselves; only planned ones count.
     """
     found: dict[str, Owner] = {}
     for each in reported:

@@ -45,18 +45,19 @@ _BY_STRENGTH = (
 
 
 class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """An endpoint of the graph, declared or not, with all that is known of it.
+    """An endpoint of the graph, declared or not: what others can match with.
 
     Attributes:
         node: fully qualified name of the node it belongs to, hidden participants resolved to
             their node; empty while unknown.
+        type: as discovery shows it, else as it is declared.
         qos: as announced or reported; None where neither is known.
         report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
         type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
         is_stranger: it is none that the system has for good: whatever can match it may be matched
             with it or not.
-        observed: discovery or its node shows it; else it is known from its declaration alone.
+        is_shown: discovery or its node shows it; else it is known from its declaration alone.
     """
 
     kind: EndpointKind
@@ -68,12 +69,12 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
     is_stranger: bool = False
-    observed: bool = True
+    is_shown: bool = True
 
     @classmethod
     def of(cls, endpoint: ObservedEndpoint) -> SeenEndpoint:
         """Return one that is not declared."""
-        return cls(
+        return SeenEndpoint(
             kind=endpoint.kind,
             node=endpoint.node,
             name=endpoint.name,
@@ -84,23 +85,20 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Actual(msgspec.Struct, frozen=True, kw_only=True):
+class Actual(SeenEndpoint, frozen=True, kw_only=True):
     """A declared endpoint and what was seen of it.
 
     Attributes:
+        owner: the node it belongs to.
         observed: what discovery shows; None if it does not show the endpoint.
-        report: what the node itself says; None if it says nothing of it.
-        end: what others can match with: as discovery shows it, else as its node says.
         unseen: discovery cannot be expected to show it to this observer; `observed` is what its
             node says then.
         beyond: its whole node is out of this observer's reach, and so is its report.
     """
 
-    node: PlannedNode
+    owner: PlannedNode
     planned: PlannedEndpoint
     observed: ObservedEndpoint | None
-    report: EndpointReport | None
-    end: SeenEndpoint
     unseen: bool = False
     beyond: bool = False
 
@@ -260,14 +258,6 @@ def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:
 def is_beyond(node: PlannedNode, machines: frozenset[str] | None) -> bool:
     """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
     return not brings_up(node, machines) and only_shared_memory(node.connections)
-
-
-def declared_addresses(plan: Plan) -> dict[str, str]:
-    """Return the declared address of each node's machine, by full node name, where there is one."""
-    machines = {each.name: each.address for each in plan.machines if each.address}
-    return {
-        node.full_name: machines[node.machine] for node in plan.nodes if node.machine in machines
-    }
 
 
 def only_shared_memory(connections: ParticipantConnections) -> bool:

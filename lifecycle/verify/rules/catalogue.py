@@ -143,8 +143,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
             return found(subject=what.subject, ends=what.ends)
         if isinstance(what, PlannedNode):
             return found(subject=what.full_name, node=what.full_name)
-        planned = what.planned
-        return found(subject=planned.resolved, node=what.node.full_name, endpoint=planned.kind)
+        return found(subject=what.name, node=what.node, endpoint=what.kind)
 
 
 PROCESS_DIED = Rule(

@@ -77,22 +77,20 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
-    node, planned = actual.node, actual.planned
-    word = planned.kind.noun
+    node, planned, word = actual.node, actual.planned, actual.kind.noun
     if actual.report is not None and actual.report.error:
         yield ENDPOINT_ERROR.on(
             actual,
-            expected=f"{word} of {node.full_name}",
+            expected=f"{word} of {node}",
             observed=actual.report.error,
-            message=f"{node.full_name} could not make its {word} {planned.name!r}:"
-            f" {actual.report.error}",
+            message=f"{node} could not make its {word} {planned.name!r}: {actual.report.error}",
         )
     elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
         yield MISSING_ENDPOINT.on(
             actual,
-            expected=f"{word} of {node.full_name}",
+            expected=f"{word} of {node}",
             observed=f"no such {word}",
-            message=f"{node.full_name} has no {word} of {planned.resolved}, which is declared",
+            message=f"{node} has no {word} of {planned.resolved}, which is declared",
             hint=_remapped(actual),
         )
     seen = actual.observed or actual.report
@@ -101,7 +99,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=planned.type,
             observed=seen.type or "no type",
-            message=f"the {word} of {planned.resolved} in {node.full_name}"
+            message=f"the {word} of {planned.resolved} in {node}"
             f" is declared as {planned.type} and is {seen.type or 'of unknown type'}",
         )
 
@@ -113,7 +111,7 @@ def _remapped(actual: Actual) -> str:
         return ""
     return (
         f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or was "
-        f"{actual.node.full_name}/remap called? the name '' gives back the declared one"
+        f"{actual.node}/remap called? the name '' gives back the declared one"
     )
 
 
@@ -122,7 +120,7 @@ def _unseen(
 ) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
     node, planned, report = actual.node, actual.planned, actual.report
-    word = planned.kind.noun
+    word = actual.kind.noun
     if report is None:
         reason = "discovery does not show it here, and its node does not report it"
     elif actual.observed is None:
@@ -137,9 +135,9 @@ def _unseen(
         reason = f"it is matched with {report.matched}, of which {known} are known here"
     yield UNSEEN_ENDPOINT.on(
         actual,
-        expected=f"{word} of {node.full_name}",
+        expected=f"{word} of {node}",
         observed="not shown by discovery",
-        message=f"nothing shows the {word} of {planned.resolved} in {node.full_name}: {reason}",
+        message=f"nothing shows the {word} of {planned.resolved} in {node}: {reason}",
     )
 
 
@@ -278,7 +276,7 @@ def _ends(view: View) -> dict[_Place, list[SeenEndpoint]]:
     """
     others = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
     services = (
-        *(each.end for each in view.actual if each.observed is not None),
+        *(each for each in view.actual if each.observed is not None),
         *map(SeenEndpoint.of, others),
     )
     found: dict[_Place, list[SeenEndpoint]] = {}

@@ -21,23 +21,12 @@ import functools
 from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport, UniqueHow
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
-from lifecycle.network.nfe import (
-    NetworkFlowEndpoint,
-    TransportProtocol,
-    UniqueRequirement,
-)
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
-from lifecycle.plan.restart import is_restarted_url
-from lifecycle.verify.network_flows import (
-    NONE,
-    UNKNOWN,
-    Uniqueness,
-    effective_transport,
-    meets,
-)
+from lifecycle.plan.restart import is_same_url
+from lifecycle.verify.network_flows import NONE, UNKNOWN, Uniqueness, effective_transport, meets
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.state import MISSING_REPORT
@@ -133,7 +122,10 @@ def _connection(
 def _urls(
     node: PlannedNode, report: ConnectionReport, planned: ParticipantConnections, first_port: int
 ) -> Iterator[Finding]:
-    if _as_planned(report.urls, planned.urls, first_port=first_port):
+    pairs = zip(planned.urls, report.urls, strict=False)
+    if len(planned.urls) == len(report.urls) and all(
+        is_same_url(*each, first_port=first_port) for each in pairs
+    ):
         return
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield OTHER_CONNECTION.on(
@@ -149,46 +141,17 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
     report = actual.report
     if report is None or report.error or not report.mapped:
         return  # that is judged as an endpoint
-    wanted = connection_of(actual.node, actual.planned)
+    wanted = connection_of(actual.owner, actual.planned)
     if report.connection == wanted:
         return
-    node, planned = actual.node, actual.planned
     yield WRONG_MAPPING.on(
         actual,
         expected=_spell_connection(wanted),
         observed=_spell_connection(report.connection),
-        message=f"the {planned.kind.noun} of {planned.resolved} in"
-        f" {node.full_name} is mapped onto {_spell_connection(report.connection)} and must be onto"
+        message=f"the {actual.kind.noun} of {actual.name} in"
+        f" {actual.node} is mapped onto {_spell_connection(report.connection)} and must be onto"
         f" {_spell_connection(wanted)}",
     )
-
-
-def _as_planned(reported: Sequence[str], planned: Sequence[str], *, first_port: int) -> bool:
-    """Whether URLs mean the same, or what a node has after a restart."""
-    was, now = _meant(planned), _meant(reported)
-    if len(was) != len(now):
-        return False
-    return all(
-        old == new
-        or (
-            isinstance(old, ConnectionUrl)
-            and isinstance(new, ConnectionUrl)
-            and is_restarted_url(str(old), str(new), first_port=first_port)
-        )
-        for old, new in zip(was, now, strict=True)
-    )
-
-
-def _meant(urls: Sequence[str]) -> tuple[ConnectionUrl | str, ...]:
-    """Return what URLs mean: one URL may be written in several ways."""
-    return tuple(_read(each) for each in urls)
-
-
-def _read(url: str) -> ConnectionUrl | str:
-    try:
-        return parse(url)
-    except ConnectionUrlError:
-        return url
 
 
 def _spell_connection(connection: str) -> str:
@@ -260,7 +223,7 @@ def _broken(actual: Actual) -> Iterator[Finding]:
             expected="at least one network flow endpoint",
             observed="none",
             message=f"nothing reaches the subscription of {planned.resolved} in"
-            f" {actual.node.full_name}: it has no network flow endpoint",
+            f" {actual.node}: it has no network flow endpoint",
         )
 
 
@@ -271,7 +234,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     if report is not None and (report.error or report.nfes == ()):
         return  # not made, or broken: that is said already
     word = planned.kind.noun
-    where = f"the {word} of {planned.resolved} in {actual.node.full_name}"
+    where = f"the {word} of {planned.resolved} in {actual.node}"
     unique = uniqueness.is_unique(actual)
     if unique is None:
         yield UNVERIFIABLE.on(
@@ -318,7 +281,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
 def _why_unproven(actual: Actual) -> str:
     """Return why the network flow endpoints of an endpoint, or of its neighbours, are not known."""
     if actual.report is None:
-        return f"{actual.node.full_name} does not report its network flow endpoints"
+        return f"{actual.node} does not report its network flow endpoints"
     if actual.report.nfes is None:
         return "its RMW does not report network flow endpoints"
     return "its process has endpoints whose network flow endpoints are not reported"
@@ -375,8 +338,8 @@ def _is_decided(view: View, flow: FlowView) -> bool:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
-        or connection_of(end.node, end.planned)
-        or end.node.connections.urls
+        or connection_of(end.owner, end.planned)
+        or end.owner.connections.urls
         for end in (*flow.publishers, *flow.subscriptions)
     )
 
@@ -440,7 +403,7 @@ def _judge_dscp(actual: Actual) -> Iterator[Finding]:
     wanted, read = planned.dscp, report.dscp if report else None
     if wanted is None:
         return
-    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node.full_name}"
+    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node}"
     if read is None:
         yield DSCP_UNVERIFIABLE.on(
             actual,

@@ -1,7 +1,5 @@
 """Decides when a publisher and a subscription are matched; rules about pairs and clients. Pure.
 
-Owns: `match` and `obstacle`, by which the rules here and `lifecycle.graph`'s links judge a pair.
-
 Judged pair by pair: each end that reports counts the peers that it is matched with. A count that is
 that of all endpoints of the graph that can match it, tools' included, proves the pair; a lower one
 is settled by the other end's, and one of zero is a violation. Where neither end reports, discovery
@@ -22,18 +20,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
 from lifecycle.manifest.qos import Certainty, incompatibilities
+from lifecycle.printable import listed
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import (
-    Actual,
-    FlowView,
-    SeenEndpoint,
-    View,
-    brings_up,
-)
+from lifecycle.verify.view import Actual, FlowView, SeenEndpoint, View, brings_up
 
 _rule = functools.partial(
     Rule,
@@ -106,14 +99,8 @@ def match(
 ) -> Match | None:
     """Judge whether two ends that can match are matched, by what both say of each other.
 
-    Args:
-        publisher: one end.
-        subscription: the other end.
-        publishers: every publisher of the topic in the graph, tools' included.
-        subscriptions: likewise.
-
-    Returns:
-        None if neither end reports its matches.
+    `publishers` and `subscriptions` are all of the topic in the graph, tools' included. None if
+    neither end reports its matches.
     """
     answers = [
         answer
@@ -163,21 +150,20 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         report = actual.report
         if report is None or not report.matched or not actual.planned.kind.is_topic:
             continue
-        if not brings_up(actual.node, view.machines):
+        if not brings_up(actual.owner, view.machines):
             continue
-        publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
-        end = actual.end
-        publishes = end.kind is EndpointKind.PUBLISHER
-        possible = len(_possible(end, subscriptions if publishes else publishers))
-        other = EndpointKind.SUBSCRIPTION if publishes else EndpointKind.PUBLISHER
-        place = (other, actual.planned.resolved)
+        publishers, subscriptions = topics.get(actual.name, _NO_ENDS)
+        publishes = actual.kind is EndpointKind.PUBLISHER
+        possible = len(_possible(actual, subscriptions if publishes else publishers))
+        other = actual.kind.other_end
+        place = (other, actual.name)
         if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
             continue
         yield UNKNOWN_PEER.on(
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
-            message=f"the {end.kind.noun} of {actual.planned.resolved} in {actual.node.full_name} "
+            message=f"the {actual.kind.noun} of {actual.name} in {actual.node} "
             f"is matched with more than the graph shows: it counts {report.matched}, and the graph "
             f"shows {possible} that can match it",
         )
@@ -189,20 +175,15 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
     if not flows:
         return
     names = [each.subject for each in flows]
-    listed = ", ".join(names[:_NAMED]) + (
-        f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
-    )
     yield UNREPORTED_FLOW.finding(
         subject=names[0] if len(names) == 1 else f"{len(names)} flows",
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
         observed="no report",
-        message=f"nothing proves that data can flow: neither end reports anything: {listed}",
+        message=f"nothing proves that data can flow: neither end reports anything: "
+        f"{listed(names, 6)}",
         at=flows[0].at,
     )
-
-
-_NAMED = 6
 
 
 def is_unreported(flow: FlowView) -> bool:
@@ -246,7 +227,7 @@ def _cause(flow: FlowView) -> str:
             return f"the {word} is missing"
     for publisher in flow.publishers:
         for subscription in flow.subscriptions:
-            if cause := obstacle(publisher.end, subscription.end):
+            if cause := obstacle(publisher, subscription):
                 return cause
     return ""
 
@@ -254,7 +235,7 @@ def _cause(flow: FlowView) -> str:
 def _judge(flow: FlowView, ends: _Ends) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
-        match(publisher.end, subscription.end, *ends)
+        match(publisher, subscription, *ends)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -321,7 +302,7 @@ def _clients(view: View) -> Iterator[Finding]:
     servers: dict[_Place, list[str]] = {}
     for actual in view.actual:
         if actual.observed is not None and actual.observed.kind in _SERVERS:
-            servers.setdefault(_place(actual.observed), []).append(actual.node.full_name)
+            servers.setdefault(_place(actual.observed), []).append(actual.node)
     if not servers:
         return
     others = Counter(
@@ -357,7 +338,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
         reason = f"it has {count} servers, and the client does not report which it is matched with"
     else:
         return
-    name, node = client.planned.resolved, client.node.full_name
+    name, node = client.planned.resolved, client.node
     says, state = "", "are not matched"
     if outcome is not Outcome.VIOLATED:
         says, state = "nothing proves that ", "are matched"

@@ -1,11 +1,9 @@
 """Rules about data as they arrive: delay, rate, loss and silence of flows. Pure.
 
-Judged is what a subscription has counted, in nodes of ours, once that can decide the declared
-number (`lifecycle.measure.flows`). Until then a bound is "measuring": it is neither ok nor
-violated. What nothing counts is unverifiable by name, from the first gate on.
-
-A 5QI stands for its packet delay budget, which 98 % of the packets keep, and its packet error rate
-(TS 23.501 Table 5.7.4-1, clause 5.7.3.4).
+Judged is what a subscription has counted, once that can decide the declared number
+(`lifecycle.measure.flows`); until then a bound is "measuring". What nothing counts is unverifiable
+by name, from the first gate on. A 5QI stands for its packet delay budget, which 98 % of the packets
+keep, and its packet error rate (TS 23.501 Table 5.7.4-1, clause 5.7.3.4).
 """
 
 from __future__ import annotations
@@ -385,10 +383,9 @@ def _unmeasured_at(
             subject=topic,
             expected=str(quantity),
             observed="not measured",
-            message=f"{quantity} of the {noun} of {topic} in {actual.node.full_name} is not"
-            f" measured: {why}",
+            message=f"{quantity} of the {noun} of {topic} in {actual.node} is not measured: {why}",
             at=quantity.at,
-            node=actual.node.full_name,
+            node=actual.node,
             endpoint=actual.planned.kind,
         )
 

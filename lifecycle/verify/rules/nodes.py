@@ -1,13 +1,13 @@
 """Rules about node names: missing, undeclared, duplicate; and endpoints of undeclared nodes. Pure.
 
-What decides on an endpoint of a tolerated tool or an unknown node is what it does, not what its
-node is called: a publisher on a declared topic and a server of a declared service or action feed
-the system, whichever node owns them. A node that only subscribes or calls is tolerated where the
-policy names it.
+A publisher on a declared topic and a server of a declared service or action feed the system,
+whatever their node is called. One that only subscribes or calls is tolerated where the policy names
+it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
@@ -134,11 +134,9 @@ def _renames(process: PlannedProcess) -> bool:
 
 
 def _duplicate(view: View) -> Iterator[Finding]:
-    identities: dict[str, int] = {}
-    for configuration in view.reported:
-        identities[configuration.name] = identities.get(configuration.name, 0) + 1
+    identities = Counter(each.name for each in view.reported)
     for name, observed in view.observed.items():
-        count = max(observed.count, identities.get(name, 0))
+        count = max(observed.count, identities[name])
         if count < 2:
             continue
         node = view.planned.get(name)

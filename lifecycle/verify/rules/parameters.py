@@ -13,6 +13,7 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import SIM_TIME, EndpointKind, ParameterValue
 from lifecycle.plan.model import ExpectedParameter, PlannedNode, uses_sim_time
 from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
+from lifecycle.printable import listed
 from lifecycle.verify.observation import SERVES_NONE, ObservedEndpoint, ParameterReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
@@ -222,8 +223,7 @@ def _unread(node: PlannedNode, file: str) -> Finding:
 def _listed(names: Sequence[str]) -> str:
     if len(names) == 1:
         return f"parameter {names[0]}"
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"parameters {', '.join(names[:_NAMED])}{more}"
+    return f"parameters {listed(names, _NAMED)}"
 
 
 def _origin(expected: ExpectedParameter) -> str:
@@ -428,12 +428,7 @@ def _publishes(node: PlannedNode) -> bool:
 
 
 def _named(users: list[PlannedNode]) -> str:
-    names = [each.full_name for each in users]
-    more = f" and {len(names) - _NAMED_USERS} more" if len(names) > _NAMED_USERS else ""
-    return ", ".join(names[:_NAMED_USERS]) + more
-
-
-_NAMED_USERS = 4
+    return listed([each.full_name for each in users], 4)
 
 
 def _place(users: list[PlannedNode]) -> dict[str, Any]:

@@ -21,12 +21,7 @@ from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import (
-    Actual,
-    NodeFacts,
-    SeenEndpoint,
-    View,
-)
+from lifecycle.verify.view import Actual, NodeFacts, SeenEndpoint, View
 
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",
@@ -79,10 +74,10 @@ def _of_node(facts: NodeFacts) -> Iterator[Finding]:
 
 def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]:
     """Judge what is written of one endpoint; what is written and not known goes to `unknown`."""
-    planned, node = actual.planned, actual.node
+    planned = actual.planned
     if planned.qos is None or _leaves_all(planned.qos):
         return
-    known = actual.end.qos
+    known = actual.qos
     differing: list[tuple[str, str, str]] = []
     hidden: list[tuple[str, str]] = []
     for policy in _comparable(planned, planned.qos):
@@ -93,7 +88,7 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
         elif have != want:
             differing.append((policy, want, have))
     word = planned.kind.noun
-    where = f"the {word} of {planned.resolved} in {node.full_name}"
+    where = f"the {word} of {planned.resolved} in {actual.node}"
     for policy, want, have in differing:
         yield QOS_DIFFERS.on(
             actual,
@@ -178,9 +173,9 @@ def _pairs(view: View, ends: list[SeenEndpoint]) -> Iterator[Finding]:
     Of an end that nobody observed there is no QoS to compare: its node is named as out of reach,
     and its flows are proven by those that count whom they are matched with.
     """
-    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER and each.observed]
+    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER and each.is_shown]
     subscriptions = [
-        each for each in ends if each.kind is not EndpointKind.PUBLISHER and each.observed
+        each for each in ends if each.kind is not EndpointKind.PUBLISHER and each.is_shown
     ]
     done: set[tuple[str, str, str, str, str]] = set()
     for publisher in publishers:

@@ -184,10 +184,7 @@ def health_of(
 ) -> HealthReport:
     """Return what is known of a node's health, of all that the manifest names.
 
-    Args:
-        node: as it is declared.
-        own: what its `health` method returned last.
-        published: what /diagnostics says of it.
+    `own` is what its `health` method returned last, `published` what /diagnostics says of it.
     """
     said = []
     if node.health is not None and node.health.check:

@@ -27,15 +27,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.comparison import GivenParameters, PlanChange, change_between
-from tests.builders import (
-    at,
-    link,
-    need,
-    node,
-    planned,
-    publisher,
-    subscription,
-)
+from tests.builders import at, link, need, node, planned, publisher, subscription
 
 COMMAND = Run(kind=RunKind.COMMAND, command=("arm", "--fast"))
 ATTACH = Run(kind=RunKind.ATTACH)

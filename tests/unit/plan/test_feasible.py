@@ -23,16 +23,7 @@ from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.model import PlanError
-from tests.builders import (
-    at,
-    endpoint,
-    manifest,
-    need,
-    node,
-    planned,
-    publisher,
-    subscription,
-)
+from tests.builders import at, endpoint, manifest, need, node, planned, publisher, subscription
 
 TRIGGER = "std_srvs/srv/Trigger"
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED

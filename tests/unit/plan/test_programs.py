@@ -9,13 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Severity
-from lifecycle.manifest.model import (
-    EndpointKind,
-    Health,
-    Position,
-    Run,
-    RunKind,
-)
+from lifecycle.manifest.model import EndpointKind, Health, Position, Run, RunKind
 from lifecycle.plan.programs import Resolution, resolve_programs
 from tests.builders import endpoint, manifest, node, publisher, subscription
 

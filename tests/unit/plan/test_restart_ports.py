@@ -7,7 +7,7 @@ import pytest
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import Plan, PlanError
-from lifecycle.plan.restart import is_restarted_url, restarted
+from lifecycle.plan.restart import is_same_url, restarted
 from tests.builders import node, planned, publisher, subscription
 
 HOST = "tcpv4://127.0.0.1"
@@ -111,7 +111,9 @@ def test_a_host_without_ports_left_says_so():
         (f"{HOST}:8004?peer=127.0.0.1:8003", "tcpv4://127.0.0.2:10000?peer=127.0.0.1:8003", False),
         (f"{HOST}:8004", f"{HOST}:10000", False),
         ("udpv4://127.0.0.1:8004", "udpv4://127.0.0.1:10000", False),
+        ("udpv4://127.0.0.1:8004", "udpv4://127.0.0.1:8004", True),
+        (f"{HOST}:8004", "nonsense", False),
     ],
 )
 def test_a_url_after_a_restart_is_known(planned_url: str, reported: str, same: bool):
-    assert is_restarted_url(planned_url, reported, first_port=8000) is same
+    assert is_same_url(planned_url, reported, first_port=8000) is same

@@ -10,17 +10,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import (
-    EndpointKind,
-    Link,
-    Machine,
-    Manifest,
-    UniqueHow,
-)
-from lifecycle.network.nfe import (
-    NetworkFlowEndpoint,
-    UniqueRequirement,
-)
+from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, UniqueHow
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.build import build_plan
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome

@@ -13,16 +13,7 @@ from lifecycle.verify.observation import EndpointReport, HealthReport, Observati
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import node_of
 from lifecycle.verify.verdict import Finding, Stage
-from tests.builders import (
-    IMAGE,
-    at,
-    endpoint,
-    node,
-    planned,
-    publisher,
-    subscription,
-    teleop,
-)
+from tests.builders import IMAGE, at, endpoint, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,
