@@ -40,19 +40,8 @@ from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 if TYPE_CHECKING:
     from lifecycle.node.managed import Managed
 
-_CONFIGURED = frozenset(
-    {
-        NodeState.CONFIGURING,  # in on_configure everything is declared already
-        NodeState.INACTIVE_DISCONNECTED,
-        NodeState.CONNECTING,
-        NodeState.INACTIVE_CONNECTED,
-        NodeState.ACTIVATING_DISCONNECTED,
-        NodeState.ACTIVATING_CONNECTED,
-        NodeState.ACTIVE,
-        NodeState.DEACTIVATING,
-    }
-)
-"""Where endpoints are declared and not being taken away."""
+_CONFIGURED = ("configuring", "inactive", "activating", "active", "deactivating")
+"""Where endpoints are declared (in on_configure they are already) and not being taken away."""
 
 _DECLARING = {
     EndpointKind.SUBSCRIPTION: "declare_subscription",
@@ -125,7 +114,7 @@ class DataLayer:
             f"cannot declare {planned.kind.noun} {planned.name!r} while {self._name} is "
             f"{state.value!r}"
         )
-        if state not in _CONFIGURED:
+        if state.seen.label not in _CONFIGURED:
             raise LifecycleError(
                 what, hint="declare endpoints in __init__, or from on_configure until cleanup"
             )
@@ -408,7 +397,7 @@ class DataLayer:
 
     def _refuse_unconfigured(self, what: str) -> None:
         state = self._managed.state
-        if state not in _CONFIGURED:
+        if state.seen.label not in _CONFIGURED:
             raise NotConfiguredError(
                 f"cannot {what}: it is {state.value!r}",
                 hint="endpoints are declared from configure until cleanup; configure it first",

@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
     from lifecycle.node.gate import Later
 
-_WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
-"""A node that enters one of these is not the one that was verified any more."""
-
 
 class NodeInHost:
     """What a process knows of one of its nodes, whatever class it is of.
@@ -238,8 +235,8 @@ class Managed(NodeInHost):
 
     def changed(self, state: NodeState, event: Transition | None) -> None:
         """Notify others of the new state, and other tools of the edge, if they see one."""
-        if self._supervisor and state in _WITHOUT_DATA_LAYER:
-            self._let_through = False
+        if self._supervisor and state.steady and not state.connected:
+            self._let_through = False  # without its data layer it is not what was verified
         if event is not None:
             self._publish(event)
         if self._reporter is not None:

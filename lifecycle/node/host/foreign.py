@@ -37,7 +37,7 @@ from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_tex
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.gate import CountedSubscription, HeldPublisher
+from lifecycle.node.gate import GatedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
@@ -118,7 +118,7 @@ class ForeignNode(NodeInHost):
         if kind is EndpointKind.PUBLISHER:
             self.gate.add(entity, HeldPublisher(entity, self.log.warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self.gate.add(entity, CountedSubscription(entity, self.gate))
+            self.gate.add(entity, GatedSubscription(entity, self.gate))
         unwatch: Callable[[], None] | None = None
         if kind.is_topic:
             unwatch = self._watch_matches(kind, entity)
