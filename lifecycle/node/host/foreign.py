@@ -23,7 +23,6 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
@@ -39,6 +38,7 @@ from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
 from lifecycle.node.gate import GatedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
+from lifecycle.node.making import factory
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -187,16 +187,9 @@ class ForeignNode(NodeInHost):
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
         called = (profile,) if publishes else (given["callback"], profile)
         options = {name: given[name] for name in _OPTIONS if name in given}
-        if not publishes:
-            options["unique"] = planned.unique
-        if connection.participant is None:
-            return create_subscription(
-                self.node, given["msg_type"], given["topic"], *called, **options
-            )
-        make: Callable[..., Any] = connection.participant.create_subscription
-        if publishes:
-            make = connection.participant.create_publisher
-        entity = make(given["msg_type"], planned.resolved, *called, **options)
+        topic = given["topic"] if connection.participant is None else planned.resolved
+        create = factory(planned, connection, self.node)
+        entity = create(given["msg_type"], topic, *called, **options)
         self._apart[id(entity)] = connection
         return entity
 
