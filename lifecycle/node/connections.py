@@ -332,36 +332,19 @@ def _mappings(configuration: NodeConfiguration) -> dict[tuple[str, str], int | N
     }
 
 
-Listener = Callable[[ConnectionEvent], Any]
+def listen_to_connections(
+    changes: ConfigurationChanges, later: Later, listener: Callable[[ConnectionEvent], Any]
+) -> Callable[[], None]:
+    """Call `listener`, sync or async, with each event from now on; returns what ends that."""
+    before = changes.collect()
 
+    def look(after: NodeConfiguration) -> None:
+        nonlocal before
+        last, before = before, after
+        for event in events_between(last, after) if last is not None else ():
+            if inspect.iscoroutinefunction(listener):
+                later(functools.partial(listener, event))
+            else:
+                listener(event)
 
-class ConnectionEvents:
-    """Who is called when something becomes of one node's connections and mappings."""
-
-    def __init__(self, changes: ConfigurationChanges, later: Later) -> None:
-        self._changes = changes
-        self._later = later
-        self._listeners: dict[object, Listener] = {}
-        self._before: NodeConfiguration | None = None
-
-    def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener`, sync or async, with each event from now on; returns what ends that."""
-        if self._before is None:
-            self._before = self._changes.collect()
-            self._changes.listen(self._look)
-        key = object()
-        self._listeners[key] = listener
-
-        def remove() -> None:
-            self._listeners.pop(key, None)
-
-        return remove
-
-    def _look(self, after: NodeConfiguration) -> None:
-        before, self._before = self._before, after
-        for event in events_between(before, after) if before is not None else ():
-            for listener in tuple(self._listeners.values()):
-                if inspect.iscoroutinefunction(listener):
-                    self._later(functools.partial(listener, event))
-                else:
-                    listener(event)
+    return changes.listen(look)

@@ -25,7 +25,12 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.connections import Connection, ConnectionEvent, connections_of
+from lifecycle.node.connections import (
+    Connection,
+    ConnectionEvent,
+    connections_of,
+    listen_to_connections,
+)
 from lifecycle.node.endpoint import Placement, interface_name
 from lifecycle.node.gate import (
     DeclaredPublisher,
@@ -515,7 +520,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.connection_events.listen(callback)
+        managed = self.lifecycle
+        changes, later = managed.configuration_changes, managed.turns.call_soon
+        return listen_to_connections(changes, later, callback)
 
     # The factories of rclpy: what they make is gated.
 
@@ -583,17 +590,14 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
 
     def _gated(self, entity: Any, gated: Gated | None, kind: EndpointKind | None) -> None:
         """Put the gate in charge of what a factory made, and report it, until it is destroyed."""
-        assert self._gate is not None
-        destroy, gate, found = entity.destroy, self._gate, self.lifecycle.found
+        managed, destroy = self.lifecycle, entity.destroy
 
         def destroyed() -> None:
-            gate.remove(entity)
-            found.remove(entity)
+            managed.remove(entity)
             destroy()
 
         entity.destroy = destroyed
         if kind is not None:
-            own = self.lifecycle.connections.own
-            found.add(kind, Placement(connection=own, entity=entity))
+            managed.add(kind, Placement(connection=managed.connections.own, entity=entity))
         if gated is not None:
-            gate.add(entity, gated)
+            managed.gate.add(entity, gated)

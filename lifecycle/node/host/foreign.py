@@ -126,7 +126,7 @@ class ForeignNode(NodeInHost):
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
         connection = self._apart.pop(id(entity), self.connections.own)
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
-        endpoint = self.found.add(kind, placement)
+        endpoint = self.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
             follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
@@ -208,8 +208,7 @@ class ForeignNode(NodeInHost):
 
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
-        self.gate.remove(entity)
-        placement = self.found.remove(entity)
+        placement = self.remove(entity)
         if placement is None:
             return
         if placement.unwatch is not None:
@@ -231,7 +230,7 @@ class ForeignNode(NodeInHost):
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in tuple(self.found.endpoints.values()):
+        for each in tuple(self.found.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -255,10 +254,10 @@ class ForeignNode(NodeInHost):
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for each in tuple(self.found.endpoints.values()):
+        for each in tuple(self.found.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
-        self.found.endpoints.clear()  # rclpy is about to destroy them
+        self.found.clear()  # rclpy is about to destroy them
         self._watching.drop_services(self._services)
         self.connections.close_all()
 
