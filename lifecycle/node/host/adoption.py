@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.utilities import get_default_context
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.middleware.discovery.environment import reach
@@ -30,6 +31,20 @@ if TYPE_CHECKING:
 
 Hosted = Managed | ForeignNode
 """What a host knows of one of its nodes."""
+
+
+def initialised(
+    settings: ParticipantSettings,
+    domain_id: int | None,
+    *,
+    args: list[str] | None = None,
+    context: Context | None = None,
+) -> Context:
+    """Initialise a context, by default that of the process, without signal handlers of rclpy's."""
+    made = context or get_default_context()
+    with discovery_by_profile(settings):
+        made.init(args=args or [], domain_id=domain_id)
+    return made
 
 
 class Participants:
@@ -53,9 +68,7 @@ class Participants:
             return
         context = self._default
         if self._made:
-            context = Context()
-            with discovery_by_profile(settings):
-                context.init(args=[], domain_id=self._default.get_domain_id())
+            context = initialised(settings, self._default.get_domain_id(), context=Context())
         with made_participant(context, settings):
             yield context
         self._made[settings] = context

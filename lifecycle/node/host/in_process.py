@@ -17,10 +17,9 @@ from rclpy.node import Node
 from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
 from lifecycle.node.callbacks import CallbackOutcome, Result
-from lifecycle.node.host.adoption import Adoption, maker_of
+from lifecycle.node.host.adoption import Adoption, initialised, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
 from lifecycle.plan.model import PlannedNode
@@ -70,9 +69,8 @@ class NodeInProcess:
         self._clients: dict[str, Any] = {}
         self._logs: list[Any] = []
         self._closed = False
-        self._context = Context()
-        with discovery_by_profile(ParticipantSettings.of(planned)):
-            self._context.init(args=[], domain_id=domain_id)
+        settings = ParticipantSettings.of(planned)
+        self._context = initialised(settings, domain_id, context=Context())
         self._loop = NodeLoop(self._context)
         adoption = Adoption(self._context, self._loop)
         try:
