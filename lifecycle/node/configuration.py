@@ -36,11 +36,7 @@ from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections
-from lifecycle.node.endpoint import (
-    CLIENTS,
-    Endpoint,
-    count_peers,
-)
+from lifecycle.node.endpoint import CLIENTS, Endpoint, count_peers
 from lifecycle.node.planned import parameter_reports
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import (

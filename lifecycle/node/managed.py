@@ -19,12 +19,7 @@ from lifecycle.node.data_layer import DataLayer
 from lifecycle.node.endpoint import Endpoint, Placement, interface_name, wire_name
 from lifecycle.node.gate import NodeGate
 from lifecycle.node.handlers import match
-from lifecycle.node.machine import (
-    Machine,
-    NodeState,
-    RefusedError,
-    Transition,
-)
+from lifecycle.node.machine import Machine, NodeState, RefusedError, Transition
 from lifecycle.node.planned import declare_parameters
 from lifecycle.node.services import Turns, acts_of, serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode

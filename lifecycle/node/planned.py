@@ -20,22 +20,14 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import BringUpError, LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.manifest.parameter_files import type_of
-from lifecycle.middleware.services.parameters import (
-    TYPES,
-    parameter_value,
-    to_rclpy,
-    type_word,
-)
+from lifecycle.middleware.services.parameters import TYPES, parameter_value, to_rclpy, type_word
 from lifecycle.plan.model import PlannedNode, raw_value
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.verify.observation import ParameterReport

@@ -25,10 +25,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.executors import (
-    MultiThreadedExecutor,
-    ShutdownException,
-)
+from rclpy.executors import MultiThreadedExecutor, ShutdownException
 from rclpy.node import Node
 from rclpy.timer import Timer
 
