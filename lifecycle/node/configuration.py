@@ -171,7 +171,8 @@ def collect(
         state=state.label,
         connected=state.connected,
         rmw=get_rmw_implementation_identifier(),
-        transports=transports() or _transports(reports),
+        transports=transports()
+        or tuple(sorted({nfe.medium for each in reports for nfe in each.nfes or ()})),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=reports,
@@ -307,11 +308,6 @@ def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
     if info is None or info.qos is None:
         return asked
     return replace(info.qos, history=asked.history, depth=asked.depth)
-
-
-def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
-    """Return what the node can be reached by, as far as its endpoints' NFEs show."""
-    return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
 
 
 Listener = Callable[["NodeConfiguration"], None]

@@ -161,7 +161,10 @@ class Connections:
             )
         planned = next((each for each in self._planned.values() if each.connection == name), None)
         try:
-            return self._make(name, how, planned or self._unplanned(name))
+            if planned is None:
+                base = f"_{self._node.get_name()}_{name}"[:_LONGEST_NODE_NAME]
+                planned = PlannedParticipant(name=base, dscp=None, reason="connect_to")
+            return self._make(name, how, planned)
         except LifecycleError as error:
             message = f"{what} ({', '.join(how.urls)}): {error.message}"
             self._failed[name] = Connection(name=name, urls=how.urls, error=message)
@@ -205,10 +208,6 @@ class Connections:
         for connection in reversed(tuple(self._made.values())):
             self.close(connection)
         self._failed.clear()
-
-    def _unplanned(self, name: str) -> PlannedParticipant:
-        base = f"_{self._node.get_name()}_{name}"
-        return PlannedParticipant(name=base[:_LONGEST_NODE_NAME], dscp=None, reason="connect_to")
 
     def _make(
         self, name: str, how: ParticipantConnections, planned: PlannedParticipant

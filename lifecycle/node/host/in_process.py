@@ -156,13 +156,13 @@ class NodeInProcess:
     def _is_matched(self) -> bool:
         return (
             all(each.get_subscription_count() for each in self._publishers.values())
-            and all(self.peer.count_publishers(each) for each in self._topics())
+            and all(
+                self.peer.count_publishers(each.resolved)
+                for each in self._planned.endpoints
+                if each.kind is EndpointKind.PUBLISHER
+            )
             and all(each.service_is_ready() for each in self._clients.values())
         )
-
-    def _topics(self) -> tuple[str, ...]:
-        kind = EndpointKind.PUBLISHER
-        return tuple(each.resolved for each in self._planned.endpoints if each.kind is kind)
 
     def change(self, transition: str) -> None:
         """Run a transition of the node, `deactivate` for one.
