@@ -33,20 +33,12 @@ from lifecycle.middleware.process.prefixes import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
-from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections
-from lifecycle.node.endpoint import (
-    CLIENTS,
-    Endpoint,
-    Placement,
-    count_peers,
-    interface_name,
-    wire_name,
-)
+from lifecycle.node.endpoint import CLIENTS, Endpoint, count_peers
 from lifecycle.node.planned import parameter_reports
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     HealthReport,
@@ -60,7 +52,6 @@ from lifecycle.verify.tool_filter import PREFIX_DIGITS
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-    from lifecycle.manifest.diagnostics import Position
     from lifecycle.node.gate import Later
     from lifecycle.node.host.adoption import Hosted
 
@@ -180,7 +171,8 @@ def collect(
         state=state.label,
         connected=state.connected,
         rmw=get_rmw_implementation_identifier(),
-        transports=transports() or _transports(reports),
+        transports=transports()
+        or tuple(sorted({nfe.medium for each in reports for nfe in each.nfes or ()})),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
         endpoints=reports,
@@ -318,43 +310,6 @@ def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
     return replace(info.qos, history=asked.history, depth=asked.depth)
 
 
-def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
-    """Return what the node can be reached by, as far as its endpoints' NFEs show."""
-    return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
-
-
-class Found:
-    """The endpoints that the code of one node makes by itself, by id of their rclpy object."""
-
-    def __init__(self, at: Position, changed: Callable[[], None]) -> None:
-        self._at = at
-        self._changed = changed
-        self.endpoints: dict[int, Endpoint] = {}
-
-    def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
-        """Note one that a factory returned."""
-        entity = placement.entity
-        planned = PlannedEndpoint(
-            kind=kind,
-            name="",
-            resolved=wire_name(entity),
-            type=interface_name(interface_of(entity)),
-            qos=None,
-            at=self._at,
-        )
-        endpoint = self.endpoints[id(entity)] = Endpoint(planned=planned, placement=placement)
-        self._changed()
-        return endpoint
-
-    def remove(self, entity: Any) -> Placement | None:
-        """Forget one that is being destroyed, and return where it was; None if it is not known."""
-        endpoint = self.endpoints.pop(id(entity), None)
-        if endpoint is None:
-            return None
-        self._changed()
-        return endpoint.placement
-
-
 Listener = Callable[["NodeConfiguration"], None]
 
 
@@ -381,9 +336,15 @@ class ConfigurationChanges:
         self._lock = threading.Lock()
         self._scheduled = False
 
-    def listen(self, listener: Listener) -> None:
-        """Call `listener` with the configuration, in the executor, after each change."""
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Call `listener` in the executor after each change; returns what ends that."""
         self._listeners.append(listener)
+
+        def remove() -> None:
+            if listener in self._listeners:
+                self._listeners.remove(listener)
+
+        return remove
 
     def close(self) -> None:
         """Notify of nothing any more: the node's process leaves DDS."""
@@ -404,7 +365,7 @@ class ConfigurationChanges:
             self._scheduled = False
         configuration = self.collect() if self._listeners else None
         if configuration is not None:
-            for listener in self._listeners:
+            for listener in tuple(self._listeners):
                 listener(configuration)
 
     def collect(self) -> NodeConfiguration | None:

@@ -161,7 +161,10 @@ class Connections:
             )
         planned = next((each for each in self._planned.values() if each.connection == name), None)
         try:
-            return self._make(name, how, planned or self._unplanned(name))
+            if planned is None:
+                base = f"_{self._node.get_name()}_{name}"[:_LONGEST_NODE_NAME]
+                planned = PlannedParticipant(name=base, dscp=None, reason="connect_to")
+            return self._make(name, how, planned)
         except LifecycleError as error:
             message = f"{what} ({', '.join(how.urls)}): {error.message}"
             self._failed[name] = Connection(name=name, urls=how.urls, error=message)
@@ -205,10 +208,6 @@ class Connections:
         for connection in reversed(tuple(self._made.values())):
             self.close(connection)
         self._failed.clear()
-
-    def _unplanned(self, name: str) -> PlannedParticipant:
-        base = f"_{self._node.get_name()}_{name}"
-        return PlannedParticipant(name=base[:_LONGEST_NODE_NAME], dscp=None, reason="connect_to")
 
     def _make(
         self, name: str, how: ParticipantConnections, planned: PlannedParticipant
@@ -332,36 +331,19 @@ def _mappings(configuration: NodeConfiguration) -> dict[tuple[str, str], int | N
     }
 
 
-Listener = Callable[[ConnectionEvent], Any]
+def listen_to_connections(
+    changes: ConfigurationChanges, later: Later, listener: Callable[[ConnectionEvent], Any]
+) -> Callable[[], None]:
+    """Call `listener`, sync or async, with each event from now on; returns what ends that."""
+    before = changes.collect()
 
+    def look(after: NodeConfiguration) -> None:
+        nonlocal before
+        last, before = before, after
+        for event in events_between(last, after) if last is not None else ():
+            if inspect.iscoroutinefunction(listener):
+                later(functools.partial(listener, event))
+            else:
+                listener(event)
 
-class ConnectionEvents:
-    """Who is called when something becomes of one node's connections and mappings."""
-
-    def __init__(self, changes: ConfigurationChanges, later: Later) -> None:
-        self._changes = changes
-        self._later = later
-        self._listeners: dict[object, Listener] = {}
-        self._before: NodeConfiguration | None = None
-
-    def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener`, sync or async, with each event from now on; returns what ends that."""
-        if self._before is None:
-            self._before = self._changes.collect()
-            self._changes.listen(self._look)
-        key = object()
-        self._listeners[key] = listener
-
-        def remove() -> None:
-            self._listeners.pop(key, None)
-
-        return remove
-
-    def _look(self, after: NodeConfiguration) -> None:
-        before, self._before = self._before, after
-        for event in events_between(before, after) if before is not None else ():
-            for listener in tuple(self._listeners.values()):
-                if inspect.iscoroutinefunction(listener):
-                    self._later(functools.partial(listener, event))
-                else:
-                    listener(event)
+    return changes.listen(look)

@@ -40,19 +40,8 @@ from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 if TYPE_CHECKING:
     from lifecycle.node.managed import Managed
 
-_CONFIGURED = frozenset(
-    {
-        NodeState.CONFIGURING,  # in on_configure everything is declared already
-        NodeState.INACTIVE_DISCONNECTED,
-        NodeState.CONNECTING,
-        NodeState.INACTIVE_CONNECTED,
-        NodeState.ACTIVATING_DISCONNECTED,
-        NodeState.ACTIVATING_CONNECTED,
-        NodeState.ACTIVE,
-        NodeState.DEACTIVATING,
-    }
-)
-"""Where endpoints are declared and not being taken away."""
+_CONFIGURED = ("configuring", "inactive", "activating", "active", "deactivating")
+"""Where endpoints are declared (in on_configure they are already) and not being taken away."""
 
 _DECLARING = {
     EndpointKind.SUBSCRIPTION: "declare_subscription",
@@ -125,7 +114,7 @@ class DataLayer:
             f"cannot declare {planned.kind.noun} {planned.name!r} while {self._name} is "
             f"{state.value!r}"
         )
-        if state not in _CONFIGURED:
+        if state.seen.label not in _CONFIGURED:
             raise LifecycleError(
                 what, hint="declare endpoints in __init__, or from on_configure until cleanup"
             )
@@ -149,7 +138,7 @@ class DataLayer:
         if not self.is_made or self._is_mapped_by_others:
             return
         try:
-            self._map(endpoint, self.connections.planned(endpoint.planned.participant))
+            self._move(endpoint, self.connections.planned(endpoint.planned.participant))
         except BaseException:
             self._forget(endpoint)
             raise
@@ -299,7 +288,7 @@ class DataLayer:
                     self.connections.planned(planned.name)
             for current in self.endpoints.values():
                 if current.placement is None:
-                    self._map(current, self.connections.planned(current.planned.participant))
+                    self._move(current, self.connections.planned(current.planned.participant))
         except Exception as error:
             for each in reversed(self.endpoints.values()):
                 if each not in before:
@@ -350,6 +339,8 @@ class DataLayer:
             planned = endpoint.planned.participant
             if target is self.connections.own and not self.connections.is_named(planned):
                 target = self.connections.planned(planned)
+            if endpoint.connection is target:
+                return endpoint.handover.done if endpoint.handover is not None else _done()
             return self._move(endpoint, target)
         except LifecycleError as error:
             message = (
@@ -393,35 +384,24 @@ class DataLayer:
         expanded = self._maker.expand(endpoint, name) if name else ""
         if expanded == before:
             return
-        if endpoint.handover is not None:
-            endpoint.handover.end()
         endpoint.given_name = expanded
-        old = endpoint.placement
-        if old is not None:
+        if endpoint.connection is not None:
             try:
-                endpoint.placement = self._place(endpoint, old.connection)
+                self._move(endpoint, endpoint.connection, at_once=True)
             except BaseException:
                 endpoint.given_name = before
                 raise
-            self._take_over(endpoint, old)
         self._changed()
 
     def _refuse_unconfigured(self, what: str) -> None:
         state = self._managed.state
-        if state not in _CONFIGURED:
+        if state.seen.label not in _CONFIGURED:
             raise NotConfiguredError(
                 f"cannot {what}: it is {state.value!r}",
                 hint="endpoints are declared from configure until cleanup; configure it first",
             )
 
     # Single endpoints.
-
-    def _map(self, endpoint: Endpoint, connection: Connection) -> None:
-        """Map an endpoint that is mapped nowhere; raises LifecycleError."""
-        endpoint.placement = self._place(endpoint, connection)
-        if endpoint.handle is not None:
-            endpoint.handle.attach(endpoint.entity)
-        self._changed()
 
     def _unmap(self, endpoint: Endpoint) -> None:
         """Take an endpoint off where it is; harmless if it is nowhere."""
@@ -435,51 +415,38 @@ class DataLayer:
         endpoint.placement = None
         self._unplace(endpoint, placement)
 
-    def _move(self, endpoint: Endpoint, connection: Connection) -> Future:
-        """Map an endpoint onto another connection, make before break; raises LifecycleError."""
-        if endpoint.connection is not connection:
-            if endpoint.handover is not None:
-                endpoint.handover.end()
-            if endpoint.placement is None:
-                self._map(endpoint, connection)
-            else:
-                return self._hand_over(endpoint, endpoint.placement, connection)
-            endpoint.error = ""
-        elif endpoint.handover is not None:
-            return endpoint.handover.done
-        done: Future = Future()
-        done.set_result(None)
-        return done
+    def _move(self, endpoint: Endpoint, connection: Connection, *, at_once: bool = False) -> Future:
+        """Make an endpoint on a connection, before it breaks where it was; raises LifecycleError.
 
-    def _hand_over(self, endpoint: Endpoint, old: Placement, connection: Connection) -> Future:
-        """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
-        peers = _peers(endpoint)
+        Returns:
+            Done once it is nowhere else.
+        """
+        if endpoint.handover is not None:
+            endpoint.handover.end()
+        old, peers = endpoint.placement, _peers(endpoint)
         endpoint.placement = self._place(endpoint, connection)
         endpoint.error = ""
 
         def finish() -> None:
             endpoint.handover = None
-            self._take_over(endpoint, old)
-            self._tidy()
+            if endpoint.handle is not None:
+                qos = endpoint.planned.qos
+                if old is not None and (qos is None or qos.reliability.name != "BEST_EFFORT"):
+                    old.entity.wait_for_all_acked(_ACKNOWLEDGED)
+                endpoint.handle.attach(endpoint.entity)
+            if old is not None:
+                self._unplace(endpoint, old)
+                self._tidy()
             self._changed()
 
         # Two servers would both answer; and a client's answers may still be under way.
         lives_on = peers > 0 if endpoint.kind.is_topic else endpoint.kind in CLIENTS
-        handover = endpoint.handover = Handover(old, peers or 1, self._turns, finish)
-        if not lives_on or self._node.executor is None:
-            handover.end()
-        else:
-            handover.peers_changed(_peers(endpoint))
+        if old is None or at_once or not lives_on or self._node.executor is None:
+            finish()
+            return _done()
+        endpoint.handover = handover = Handover(old, peers or 1, self._turns, finish)
+        handover.peers_changed(_peers(endpoint))
         return handover.done
-
-    def _take_over(self, endpoint: Endpoint, old: Placement) -> None:
-        """Let the new one do what the old one did until now, which is destroyed."""
-        if endpoint.handle is not None:
-            qos = endpoint.planned.qos
-            if qos is None or qos.reliability.name != "BEST_EFFORT":
-                old.entity.wait_for_all_acked(_ACKNOWLEDGED)
-            endpoint.handle.attach(endpoint.entity)
-        self._unplace(endpoint, old)
 
     def _place(self, endpoint: Endpoint, connection: Connection) -> Placement:
         """Make an endpoint on a connection; where it is now is left alone."""
@@ -531,6 +498,12 @@ class DataLayer:
 def _peers(endpoint: Endpoint) -> int:
     """Return how many peers an endpoint has where it is now; 0 of what has no count."""
     return count_peers(endpoint.entity) if endpoint.kind.is_topic and endpoint.placement else 0
+
+
+def _done() -> Future:
+    done: Future = Future()
+    done.set_result(None)
+    return done
 
 
 def _refuse_other(planned: PlannedEndpoint, before: PlannedEndpoint) -> None:

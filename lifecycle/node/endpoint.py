@@ -47,34 +47,26 @@ def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
     Raises:
         UnknownEndpointError: it means none, or more than one.
     """
-    keys = list(declared)
-    by_spelling = {kind.spell(name): (kind, name) for kind, name in keys}
+    by_spelling = {kind.spell(name): (kind, name) for kind, name in declared}
     if spelling in by_spelling:
         return by_spelling[spelling]
-    named = [key for key in keys if key[1] == spelling]
+    named = [each for each, (_, name) in by_spelling.items() if name == spelling]
     if len(named) == 1:
-        return named[0]
+        return by_spelling[named[0]]
     if named:
-        choices = " or ".join(repr(kind.spell(name)) for kind, name in named)
         raise UnknownEndpointError(
-            f"cannot tell which {spelling!r} of {node} is meant", hint=f"write {choices}"
+            f"cannot tell which {spelling!r} of {node} is meant",
+            hint=f"write {' or '.join(map(repr, named))}",
         )
-    if not keys:
-        raise UnknownEndpointError(
-            f"cannot find endpoint {spelling!r} of {node}",
-            hint="endpoints are declared at configure; ask from on_configure on",
-        )
-    near = nearest(spelling, by_spelling)
-    if not near:
-        kind, _, name = spelling.partition("/")
-        is_kind = kind in {each.value for each in EndpointKind}
-        near_name = nearest(name if is_kind else spelling, [name for _, name in keys])
-        near = next((each for each, key in by_spelling.items() if key[1] == near_name), "")
-    listed = ", ".join(repr(each) for each in by_spelling)
-    raise UnknownEndpointError(
-        f"cannot find endpoint {spelling!r} of {node}",
-        hint=(f"did you mean {near!r}? " if near else "") + f"declared: {listed}",
-    )
+    hint = "endpoints are declared at configure; ask from on_configure on"
+    if by_spelling:
+        # A word is nearest to one of its own kind: `vidoe` to `video`, with a kind to all of it.
+        words = {name: each for each, (_, name) in by_spelling.items()}
+        words |= {each: each for each in by_spelling}
+        near = words.get(nearest(spelling, words), "")
+        listed = ", ".join(map(repr, by_spelling))
+        hint = (f"did you mean {near!r}? " if near else "") + f"declared: {listed}"
+    raise UnknownEndpointError(f"cannot find endpoint {spelling!r} of {node}", hint=hint)
 
 
 def wire_name(entity: Any) -> str:

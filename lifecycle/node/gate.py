@@ -85,9 +85,9 @@ class NodeGate:
             gated.open()
 
     @property
-    def _counted(self) -> list[CountedSubscription]:
+    def _counted(self) -> list[GatedSubscription]:
         entities = tuple(self._entities.values())
-        return [each for each in entities if isinstance(each, CountedSubscription)]
+        return [each for each in entities if isinstance(each, GatedSubscription)]
 
     def measured(self) -> Measured | None:
         """Return what subscriptions have counted; None while it is closed. From any thread."""
@@ -174,20 +174,36 @@ class HeldPublisher(GatedPublisher):
             self._kept.add(msg)
 
 
-class CountedSubscription:
-    """Counts what arrives while open: `lifecycle.measure`. Closed it leaves messages alone.
+class GatedSubscription:
+    """Counts what arrives while open (`lifecycle.measure`); takes and drops messages while closed.
 
-    A callback of ours takes message info always: rclpy decides that for each message before the
-    gate may swap the callback.
+    So old ones do not wait for activation. A TRANSIENT_LOCAL sample is state, not an event, and
+    sent once: the last `depth` of those are kept while closed and given to the callback when
+    opened. A callback of ours takes message info always: rclpy decides that for each message
+    before the gate may swap the callback.
+
+    Args:
+        subscription: rclpy's.
+        gate: of its node.
+        later: of its node; None for one whose executor the gate holds: then messages are left
+            alone while it is closed.
 
     Raises:
         LifecycleError: its callback takes message info, and its node's gate counts nothing.
     """
 
-    def __init__(self, subscription: Subscription, gate: NodeGate) -> None:
+    def __init__(
+        self, subscription: Subscription, gate: NodeGate, later: Later | None = None
+    ) -> None:
         self._subscription = subscription
         self._topic = str(subscription.topic_name)
         self._gate = gate
+        self._later = later
+        qos = subscription.qos_profile
+        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
+        self._kept: collections.deque[tuple[object, ...]] = collections.deque(
+            maxlen=qos.depth or None
+        )
         self._call = subscription.callback
         self._counter: Counter | None = None
         takes_one = _takes_one(self._call)
@@ -200,7 +216,7 @@ class CountedSubscription:
             self._call = _taking_info(self._call)
 
     def open(self) -> None:
-        """Count from now on."""
+        """Give messages to the user's callback, those first that were kept."""
         is_apart = self._topic in self._gate.apart
         if not self._gate.counts:
             self._subscription.callback = self._call
@@ -208,44 +224,20 @@ class CountedSubscription:
             now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             self._counter = Counter(now_ns, wall_ns, is_apart=is_apart)
             self._subscription.callback = counting(self._call, self._counter)
+        if self._kept and self._later is not None:
+            self._later(self._deliver)
 
     def close(self) -> None:
-        """Count no more."""
+        """Count no more, and drop messages."""
         self._counter = None
         self._subscription.callback = self._call
+        if self._later is not None:
+            self._subscription.callback = self._drop if self._gate.counts else self._keep
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""
         counter = self._counter
         return None if counter is None else (self._topic, counter.sample(now_ns))
-
-
-class GatedSubscription(CountedSubscription):
-    """Takes and drops messages while closed, so that old ones do not wait for activation.
-
-    A TRANSIENT_LOCAL sample is state, not an event, and sent once. So the last `depth` of those are
-    kept while closed and given to the callback when opened.
-    """
-
-    def __init__(self, subscription: Subscription, gate: NodeGate, later: Later) -> None:
-        super().__init__(subscription, gate)
-        self._later = later
-        qos = subscription.qos_profile
-        self._keeps = qos.durability.name == "TRANSIENT_LOCAL"
-        self._kept: collections.deque[tuple[object, ...]] = collections.deque(
-            maxlen=qos.depth or None
-        )
-
-    def open(self) -> None:
-        """Give messages to the user's callback, those first that were kept."""
-        super().open()
-        if self._kept:
-            self._later(self._deliver)
-
-    def close(self) -> None:
-        """Drop messages."""
-        super().close()
-        self._subscription.callback = self._drop if self._gate.counts else self._keep
 
     def _drop(self, message: object, info: Info) -> None:
         self._keep(message, info)

@@ -90,7 +90,7 @@ class NodeState(enum.Enum):
     @property
     def steady(self) -> bool:
         """A state that a node may stay in, where requests are taken."""
-        return self in _STEADY
+        return self not in CALLBACKS
 
 
 _SEEN = {state.label: state for state in AVAILABLE_STATES}
@@ -102,15 +102,6 @@ _CONNECTED = frozenset(
         NodeState.ACTIVE,
         NodeState.DEACTIVATING,
         NodeState.CLEANINGUP_CONNECTED,
-    }
-)
-_STEADY = frozenset(
-    {
-        NodeState.UNCONFIGURED,
-        NodeState.INACTIVE_DISCONNECTED,
-        NodeState.INACTIVE_CONNECTED,
-        NodeState.ACTIVE,
-        NodeState.FINALIZED,
     }
 )
 
@@ -181,13 +172,7 @@ TABLE = (
         after="data_layer.make",
     ),
     Row(0, _OK, _S.ACTIVATING_DISCONNECTED, _S.ACTIVATING_CONNECTED),
-    Row(
-        3,
-        "activate",
-        _S.INACTIVE_CONNECTED,
-        _S.ACTIVATING_CONNECTED,
-        condition="may_activate",
-    ),
+    Row(3, "activate", _S.INACTIVE_CONNECTED, _S.ACTIVATING_CONNECTED, condition="may_activate"),
     Row(30, _OK, _S.ACTIVATING_CONNECTED, _S.ACTIVE, before="gate.open"),
     Row(
         31,

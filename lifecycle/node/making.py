@@ -29,6 +29,7 @@ from lifecycle.node.gate import GatedSubscription
 if TYPE_CHECKING:
     from lifecycle.node.connections import Connection
     from lifecycle.node.managed import Managed
+    from lifecycle.plan.model import PlannedEndpoint
 
 
 _DESTROY = {
@@ -51,11 +52,7 @@ class Maker:
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
         """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
         kind, introspection = endpoint.kind, endpoint.options.get("introspection")
-        make = self._served
-        if kind is EndpointKind.PUBLISHER:
-            make = self._publisher
-        elif kind is EndpointKind.SUBSCRIPTION:
-            make = self._subscription
+        make = self._topic_end if kind.is_topic else self._served
         entity = make(endpoint, connection, self._name(endpoint, connection))
         if introspection is not None:
             entity.configure_introspection(
@@ -94,27 +91,12 @@ class Maker:
                 f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
             ) from error
 
-    def _publisher(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        qos = endpoint.planned.qos or QosProfile()
-        options = endpoint.options
-        if connection.participant is not None:
-            return connection.participant.create_publisher(endpoint.interface, name, qos, **options)
-        return create_publisher(
-            self._node, endpoint.interface, name, qos, unique=endpoint.planned.unique, **options
-        )
-
-    def _subscription(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        make: Callable[..., Any] = functools.partial(create_subscription, self._node)
-        if connection.participant is not None:
-            make = connection.participant.create_subscription
-        entity = make(
-            endpoint.interface,
-            name,
-            endpoint.handler,
-            endpoint.planned.qos or QosProfile(),
-            unique=endpoint.planned.unique,
-            **endpoint.options,
-        )
+    def _topic_end(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+        qos, options = endpoint.planned.qos or QosProfile(), endpoint.options
+        create = factory(endpoint.planned, connection, self._node)
+        if endpoint.kind is EndpointKind.PUBLISHER:
+            return create(endpoint.interface, name, qos, **options)
+        entity = create(endpoint.interface, name, endpoint.handler, qos, **options)
         self._gate.add(entity, GatedSubscription(entity, self._gate, self._turns.call_soon))
         return entity
 
@@ -188,6 +170,18 @@ class Maker:
                 )
 
         service.send_response = send_response
+
+
+def factory(planned: PlannedEndpoint, connection: Connection, node: Node) -> Callable[..., Any]:
+    """Return what makes a publisher or subscription with a planned flow on a connection."""
+    where = connection.participant
+    if planned.kind is EndpointKind.PUBLISHER:
+        if where is not None:
+            return where.create_publisher  # where it is alone, it is unique
+        return functools.partial(create_publisher, node, unique=planned.unique)
+    if where is not None:
+        return functools.partial(where.create_subscription, unique=planned.unique)
+    return functools.partial(create_subscription, node, unique=planned.unique)
 
 
 def resolve_name(node: Node, kind: EndpointKind, name: str) -> str:

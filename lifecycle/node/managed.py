@@ -10,31 +10,24 @@ from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from lifecycle.manifest.model import Executor
+from lifecycle.manifest.model import EndpointKind, Executor
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.node import configuration, services
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
-from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
-from lifecycle.node.connections import ConnectionEvents
+from lifecycle.node.configuration import ConfigurationChanges, HostedState
 from lifecycle.node.data_layer import DataLayer
+from lifecycle.node.endpoint import Endpoint, Placement, interface_name, wire_name
 from lifecycle.node.gate import NodeGate
 from lifecycle.node.handlers import match
-from lifecycle.node.machine import (
-    Machine,
-    NodeState,
-    RefusedError,
-    Transition,
-)
+from lifecycle.node.machine import Machine, NodeState, RefusedError, Transition
 from lifecycle.node.planned import declare_parameters
 from lifecycle.node.services import Turns, acts_of, serve_interface
-from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
     from lifecycle.node.gate import Later
-
-_WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
-"""A node that enters one of these is not the one that was verified any more."""
 
 
 class NodeInHost:
@@ -53,7 +46,7 @@ class NodeInHost:
         gate: holds back what it sends, receives and times, and counts what arrives.
         listeners: are called with it after every change of state, whatever caused it.
         configuration_changes: notifies of each change of its configuration.
-        found: endpoints that its code made with rclpy's factories.
+        found: endpoints that its code made with rclpy's factories, by id of their object.
     """
 
     def __init__(
@@ -76,7 +69,31 @@ class NodeInHost:
         self.configuration_changes = ConfigurationChanges(later, collect, failed=self.log.error)
         changed = self.configuration_changes.touch
         node.add_post_set_parameters_callback(lambda _: changed())
-        self.found = Found(spec.at, changed)
+        self.found: dict[int, Endpoint] = {}
+
+    def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
+        """Note an endpoint that one of rclpy's factories returned."""
+        entity = placement.entity
+        planned = PlannedEndpoint(
+            kind=kind,
+            name="",
+            resolved=wire_name(entity),
+            type=interface_name(interface_of(entity)),
+            qos=None,
+            at=self.spec.at,
+        )
+        endpoint = self.found[id(entity)] = Endpoint(planned=planned, placement=placement)
+        self.configuration_changes.touch()
+        return endpoint
+
+    def remove(self, entity: Any) -> Placement | None:
+        """Forget what is being destroyed, and return where it was; None if it is not known."""
+        self.gate.remove(entity)
+        endpoint = self.found.pop(id(entity), None)
+        if endpoint is None:
+            return None
+        self.configuration_changes.touch()
+        return endpoint.placement
 
 
 class Managed(NodeInHost):
@@ -87,7 +104,6 @@ class Managed(NodeInHost):
         turns: has things done in its executor.
         data_layer: its endpoints.
         connections: its participants.
-        connection_events: what becomes of its connections and mappings.
     """
 
     def __init__(
@@ -109,7 +125,6 @@ class Managed(NodeInHost):
         self._health = None if health is None else HealthCheck(self, health)
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
-        self.connection_events = ConnectionEvents(self.configuration_changes, self.turns.call_soon)
         self._machine = Machine(self, spec.timeouts)
         if served:
             self._publish = services.serve(node, self._machine, self.turns.group)
@@ -194,7 +209,7 @@ class Managed(NodeInHost):
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         return configuration.collect(
             self,
-            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints.values()),
+            endpoints=(*self.data_layer.endpoints.values(), *self.found.values()),
             health=None if self._health is None else self._health.report,
         )
 
@@ -238,8 +253,8 @@ class Managed(NodeInHost):
 
     def changed(self, state: NodeState, event: Transition | None) -> None:
         """Notify others of the new state, and other tools of the edge, if they see one."""
-        if self._supervisor and state in _WITHOUT_DATA_LAYER:
-            self._let_through = False
+        if self._supervisor and state.steady and not state.connected:
+            self._let_through = False  # without its data layer it is not what was verified
         if event is not None:
             self._publish(event)
         if self._reporter is not None:

@@ -25,10 +25,16 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.connections import Connection, ConnectionEvent, connections_of
+from lifecycle.node.connections import (
+    Connection,
+    ConnectionEvent,
+    connections_of,
+    listen_to_connections,
+)
 from lifecycle.node.endpoint import Placement, interface_name
 from lifecycle.node.gate import (
     DeclaredPublisher,
+    Gated,
     GatedPublisher,
     GatedSubscription,
     GatedTimer,
@@ -514,7 +520,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.connection_events.listen(callback)
+        managed = self.lifecycle
+        changes, later = managed.configuration_changes, managed.turns.call_soon
+        return listen_to_connections(changes, later, callback)
 
     # The factories of rclpy: what they make is gated.
 
@@ -524,8 +532,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's; what is published while the node is not active is dropped."""
         publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
         if self._gate is not None:
-            self._found(EndpointKind.PUBLISHER, publisher)
-            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
+            gated = GatedPublisher(publisher, self.lifecycle.log.warning)
+            self._gated(publisher, gated, EndpointKind.PUBLISHER)
         return publisher
 
     def create_subscription(
@@ -543,10 +551,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         # /clock belongs to rclpy: simulated time must pass in every state.
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
-            self._found(EndpointKind.SUBSCRIPTION, subscription)
-            later = self.lifecycle.turns.call_soon
-            gated = GatedSubscription(subscription, self._gate, later)
-            self._gate.add(subscription, gated)
+            gated = GatedSubscription(subscription, self._gate, self.lifecycle.turns.call_soon)
+            self._gated(subscription, gated, EndpointKind.SUBSCRIPTION)
         return subscription
 
     def create_timer(
@@ -561,7 +567,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         timer = super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
         # No callback is rclpy.Rate's: a thread that sleeps must wake up.
         if self._gate is not None and callback is not None:
-            self._gate.add(timer, GatedTimer(timer, wanted=autostart))
+            self._gated(timer, GatedTimer(timer, wanted=autostart), None)
         return timer
 
     def create_client(self, srv_type: Any, srv_name: str, **options: Any) -> Client:
@@ -570,7 +576,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             options["callback_group"] = self.lifecycle.turns.group
         client = super().create_client(srv_type, srv_name, **options)
         refuse_to_deadlock(client)
-        self._found(EndpointKind.SERVICE_CLIENT, client)
+        self._gated(client, None, EndpointKind.SERVICE_CLIENT)
         return client
 
     def create_service(
@@ -579,39 +585,19 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's."""
         service = super().create_service(srv_type, srv_name, callback, **options)
         if self._gate is not None:
-            self._found(EndpointKind.SERVICE_SERVER, service)
+            self._gated(service, None, EndpointKind.SERVICE_SERVER)
         return service
 
-    def destroy_publisher(self, publisher: Publisher) -> bool:
-        """As rclpy's."""
-        self._forget(publisher)
-        return bool(super().destroy_publisher(publisher))
+    def _gated(self, entity: Any, gated: Gated | None, kind: EndpointKind | None) -> None:
+        """Put the gate in charge of what a factory made, and report it, until it is destroyed."""
+        managed, destroy = self.lifecycle, entity.destroy
 
-    def destroy_subscription(self, subscription: Subscription) -> bool:
-        """As rclpy's."""
-        self._forget(subscription)
-        return bool(super().destroy_subscription(subscription))
+        def destroyed() -> None:
+            managed.remove(entity)
+            destroy()
 
-    def destroy_client(self, client: Client) -> bool:
-        """As rclpy's."""
-        self._forget(client)
-        return bool(super().destroy_client(client))
-
-    def destroy_service(self, service: Service) -> bool:
-        """As rclpy's."""
-        self._forget(service)
-        return bool(super().destroy_service(service))
-
-    def destroy_timer(self, timer: Timer) -> bool:
-        """As rclpy's."""
-        self._forget(timer)
-        return bool(super().destroy_timer(timer))
-
-    def _found(self, kind: EndpointKind, entity: Any) -> None:
-        own = self.lifecycle.connections.own
-        self.lifecycle.found.add(kind, Placement(connection=own, entity=entity))
-
-    def _forget(self, entity: object) -> None:
-        if self._gate is not None:
-            self._gate.remove(entity)
-            self.lifecycle.found.remove(entity)
+        entity.destroy = destroyed
+        if kind is not None:
+            managed.add(kind, Placement(connection=managed.connections.own, entity=entity))
+        if gated is not None:
+            managed.gate.add(entity, gated)

@@ -20,10 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import BringUpError, LifecycleError, did_you_mean

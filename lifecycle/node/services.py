@@ -52,32 +52,28 @@ def serve(
     events = Node.create_publisher(
         node, msg.TransitionEvent, "~/transition_event", _TRANSITION_EVENT_DEPTH
     )
-    answers: tuple[tuple[Any, str, Callable[[Any, Any], Any]], ...] = (
-        (srv.ChangeState, "change_state", functools.partial(_change_state, node, state_machine)),
-        (
+    states = [_state(each) for each in machine.AVAILABLE_STATES]
+    edges = srv.GetAvailableTransitions
+    answers: dict[str, tuple[Any, Callable[[Any, Any], Any]]] = {
+        "change_state": (
+            srv.ChangeState,
+            functools.partial(_change_state, node, state_machine),
+        ),
+        "get_state": (
             srv.GetState,
-            "get_state",
             lambda *_: srv.GetState.Response(current_state=_state(state_machine.state.seen)),
         ),
-        (
+        "get_available_states": (
             srv.GetAvailableStates,
-            "get_available_states",
-            lambda *_: srv.GetAvailableStates.Response(
-                available_states=[_state(each) for each in machine.AVAILABLE_STATES]
-            ),
+            lambda *_: srv.GetAvailableStates.Response(available_states=states),
         ),
-        (
-            srv.GetAvailableTransitions,
-            "get_available_transitions",
+        "get_available_transitions": (
+            edges,
             lambda *_: _described(state_machine.available_transitions()),
         ),
-        (
-            srv.GetAvailableTransitions,
-            "get_transition_graph",
-            lambda *_: _described(machine.TRANSITION_GRAPH),
-        ),
-    )
-    for type_, name, answer in answers:
+        "get_transition_graph": (edges, lambda *_: _described(machine.TRANSITION_GRAPH)),
+    }
+    for name, (type_, answer) in answers.items():
         Node.create_service(node, type_, f"~/{name}", answer, callback_group=group)
 
     def publish(transition: machine.Transition) -> None:

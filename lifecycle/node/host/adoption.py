@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.utilities import get_default_context
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.middleware.fastdds.discovery import reach
@@ -30,6 +31,20 @@ if TYPE_CHECKING:
 
 Hosted = Managed | ForeignNode
 """What a host knows of one of its nodes."""
+
+
+def initialised(
+    settings: ParticipantSettings,
+    domain_id: int | None,
+    *,
+    args: list[str] | None = None,
+    context: Context | None = None,
+) -> Context:
+    """Initialise a context, by default that of the process, without signal handlers of rclpy's."""
+    made = context or get_default_context()
+    with discovery_by_profile(settings):
+        made.init(args=args or [], domain_id=domain_id)
+    return made
 
 
 class Participants:
@@ -53,9 +68,7 @@ class Participants:
             return
         context = self._default
         if self._made:
-            context = Context()
-            with discovery_by_profile(settings):
-                context.init(args=[], domain_id=self._default.get_domain_id())
+            context = initialised(settings, self._default.get_domain_id(), context=Context())
         with made_participant(context, settings):
             yield context
         self._made[settings] = context
@@ -144,9 +157,10 @@ class Adoption:
             made: Managed = what().lifecycle
             return made
 
-    def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
+    def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: Any) -> None:
         reference = planned.run.python
-        nodes = [each for each in _each(returned) if isinstance(each, Node)]
+        several = isinstance(returned, (list, tuple, set, frozenset))
+        nodes = [each for each in (returned if several else (returned,)) if isinstance(each, Node)]
         if planned.key not in self._constructed:
             names = ", ".join(each.get_fully_qualified_name() for each in nodes) or repr(returned)
             raise BringUpError(
@@ -239,19 +253,8 @@ def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
         name: list(value) if isinstance(value, tuple) else value
         for name, value in planned.run.arguments
     }
-    if _needs(what, "node_name"):
+    wanted = inspect.signature(what).parameters.get("node_name")
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    if wanted is not None and wanted.default is wanted.empty and wanted.kind in named:
         keywords.setdefault("node_name", planned.name)
     return keywords
-
-
-def _needs(what: Callable[..., Any], name: str) -> bool:
-    """Return whether what is called so has a parameter of this name without a default."""
-    wanted = inspect.signature(what).parameters.get(name)
-    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    return wanted is not None and wanted.default is wanted.empty and wanted.kind in named
-
-
-def _each(returned: object) -> Iterable[object]:
-    if isinstance(returned, (list, tuple, set, frozenset)):
-        return returned
-    return (returned,)

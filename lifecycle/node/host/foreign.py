@@ -23,7 +23,6 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
@@ -37,8 +36,9 @@ from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_tex
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
-from lifecycle.node.gate import CountedSubscription, HeldPublisher
+from lifecycle.node.gate import GatedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
+from lifecycle.node.making import factory
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -118,7 +118,7 @@ class ForeignNode(NodeInHost):
         if kind is EndpointKind.PUBLISHER:
             self.gate.add(entity, HeldPublisher(entity, self.log.warning))
         elif kind is EndpointKind.SUBSCRIPTION:
-            self.gate.add(entity, CountedSubscription(entity, self.gate))
+            self.gate.add(entity, GatedSubscription(entity, self.gate))
         unwatch: Callable[[], None] | None = None
         if kind.is_topic:
             unwatch = self._watch_matches(kind, entity)
@@ -126,7 +126,7 @@ class ForeignNode(NodeInHost):
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
         connection = self._apart.pop(id(entity), self.connections.own)
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
-        endpoint = self.found.add(kind, placement)
+        endpoint = self.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
             follow_goals(entity, functools.partial(self._goal_ended, endpoint))
 
@@ -187,16 +187,9 @@ class ForeignNode(NodeInHost):
         profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
         called = (profile,) if publishes else (given["callback"], profile)
         options = {name: given[name] for name in _OPTIONS if name in given}
-        if not publishes:
-            options["unique"] = planned.unique
-        if connection.participant is None:
-            return create_subscription(
-                self.node, given["msg_type"], given["topic"], *called, **options
-            )
-        make: Callable[..., Any] = connection.participant.create_subscription
-        if publishes:
-            make = connection.participant.create_publisher
-        entity = make(given["msg_type"], planned.resolved, *called, **options)
+        topic = given["topic"] if connection.participant is None else planned.resolved
+        create = factory(planned, connection, self.node)
+        entity = create(given["msg_type"], topic, *called, **options)
         self._apart[id(entity)] = connection
         return entity
 
@@ -215,8 +208,7 @@ class ForeignNode(NodeInHost):
 
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
-        self.gate.remove(entity)
-        placement = self.found.remove(entity)
+        placement = self.remove(entity)
         if placement is None:
             return
         if placement.unwatch is not None:
@@ -238,7 +230,7 @@ class ForeignNode(NodeInHost):
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in tuple(self.found.endpoints.values()):
+        for each in tuple(self.found.values()):
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(
@@ -262,10 +254,10 @@ class ForeignNode(NodeInHost):
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for each in tuple(self.found.endpoints.values()):
+        for each in tuple(self.found.values()):
             if each.placement is not None and each.placement.unwatch is not None:
                 each.placement.unwatch()
-        self.found.endpoints.clear()  # rclpy is about to destroy them
+        self.found.clear()  # rclpy is about to destroy them
         self._watching.drop_services(self._services)
         self.connections.close_all()
 

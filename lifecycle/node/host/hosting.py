@@ -18,20 +18,17 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-import rclpy
 from rclpy.context import Context
-from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.measure.sample import SLOT_S
-from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import send_again_soon
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
-from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
+from lifecycle.node.host.adoption import Adoption, Hosted, initialised, maker_of
 from lifecycle.node.host.control import (
     Command,
     Event,
@@ -52,13 +49,7 @@ def process_context(spec: HostSpec) -> Context:
         settings = ParticipantSettings.of(spec.nodes[0])
     except LifecycleError:  # reported where the node is made
         settings = ParticipantSettings()
-    with discovery_by_profile(settings):
-        rclpy.init(
-            args=[],
-            domain_id=spec.domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-    return rclpy.get_default_context()
+    return initialised(settings, spec.domain_id)
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(

@@ -16,11 +16,10 @@ from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.conversions import import_interface, to_rclpy
 from lifecycle.node.callbacks import CallbackOutcome, Result
-from lifecycle.node.host.adoption import Adoption, maker_of
+from lifecycle.node.host.adoption import Adoption, initialised, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
 from lifecycle.plan.model import PlannedNode
@@ -70,9 +69,8 @@ class NodeInProcess:
         self._clients: dict[str, Any] = {}
         self._logs: list[Any] = []
         self._closed = False
-        self._context = Context()
-        with discovery_by_profile(ParticipantSettings.of(planned)):
-            self._context.init(args=[], domain_id=domain_id)
+        settings = ParticipantSettings.of(planned)
+        self._context = initialised(settings, domain_id, context=Context())
         self._loop = NodeLoop(self._context)
         adoption = Adoption(self._context, self._loop)
         try:
@@ -158,13 +156,13 @@ class NodeInProcess:
     def _is_matched(self) -> bool:
         return (
             all(each.get_subscription_count() for each in self._publishers.values())
-            and all(self.peer.count_publishers(each) for each in self._topics())
+            and all(
+                self.peer.count_publishers(each.resolved)
+                for each in self._planned.endpoints
+                if each.kind is EndpointKind.PUBLISHER
+            )
             and all(each.service_is_ready() for each in self._clients.values())
         )
-
-    def _topics(self) -> tuple[str, ...]:
-        kind = EndpointKind.PUBLISHER
-        return tuple(each.resolved for each in self._planned.endpoints if each.kind is kind)
 
     def change(self, transition: str) -> None:
         """Run a transition of the node, `deactivate` for one.

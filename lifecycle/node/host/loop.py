@@ -25,10 +25,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.executors import (
-    MultiThreadedExecutor,
-    ShutdownException,
-)
+from rclpy.executors import MultiThreadedExecutor, ShutdownException
 from rclpy.node import Node
 from rclpy.timer import Timer
 
@@ -348,7 +345,7 @@ class NodeLoop:
             hosted.configuration_changes.close()
         self._done = True
         if self._own is not self._executor:
-            self.call_beside(_nothing)  # what waits there looks again
+            self.call_beside(lambda: None)  # what waits there looks again
 
     def _give_up(self, bound_s: float, reason: str) -> None:
         """End the process when a blocking callback keeps the executor from doing so."""
@@ -359,10 +356,6 @@ class NodeLoop:
         )
         sys.stderr.flush()
         os._exit(self._code or 1)
-
-
-def _nothing() -> None:
-    """Being called is the point."""
 
 
 def _executor(kind: Executor, threads: int, context: Context) -> Any:
@@ -391,7 +384,7 @@ def on_signal(
     """
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
-    before = {number: signal.signal(number, _arrived) for number in _SIGNALS}
+    before = {number: signal.signal(number, lambda *_: None) for number in _SIGNALS}
     before_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
 
     def read() -> None:
@@ -424,7 +417,3 @@ def on_signal(
         sender.close()
         reader.join()
         receiver.close()
-
-
-def _arrived(number: int, frame: object) -> None:
-    """Replace the default action; the reading thread acts."""

@@ -17,18 +17,14 @@ import typing
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, Timeouts
 from lifecycle.manifest.names import node_alive_topic
-from lifecycle.middleware.fastdds.factory import discovery_by_profile
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue, brief
 from lifecycle.middleware.services.supervisor_topics import AliveNotice, AlivePublisher
 from lifecycle.node.callbacks import CallbackOutcome
-from lifecycle.node.host.adoption import Adoption, Hosted
+from lifecycle.node.host.adoption import Adoption, Hosted, initialised
 from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.managed import Managed
 from lifecycle.node.planned import is_auto
@@ -130,13 +126,7 @@ def run(
     """
     auto = lifecycle is not None and is_auto(lifecycle)
     settings = ParticipantSettings() if spec is None else ParticipantSettings.of(spec)
-    with discovery_by_profile(settings):
-        rclpy.init(
-            args=sys.argv if arguments is None else arguments,
-            domain_id=domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-    context = rclpy.get_default_context()
+    context = initialised(settings, domain_id, args=sys.argv if arguments is None else arguments)
     planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
     limit_s = (spec.timeouts if spec is not None else Timeouts()).silent_s
     liveliness = OwnLiveliness(limit_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,8 @@ from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections import (
     ConnectionEvent,
     ConnectionEventKind,
-    ConnectionEvents,
     events_between,
+    listen_to_connections,
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
@@ -103,14 +104,14 @@ def test_sync_and_async_listeners_are_called_until_they_are_removed() -> None:
     executor = Executor()
     now = [wired({})]
     changes = ConfigurationChanges(executor.later, lambda: now[0], failed=unexpected)
-    events = ConnectionEvents(changes, executor.later)
+    listen_to = functools.partial(listen_to_connections, changes, executor.later)
     heard: list[str] = []
 
     async def listen(event: ConnectionEvent) -> None:
         heard.append(f"async {event.connection}")
 
-    events.listen(lambda event: heard.append(f"sync {event.connection}"))
-    remove = events.listen(listen)
+    listen_to(lambda event: heard.append(f"sync {event.connection}"))
+    remove = listen_to(listen)
     for name in ("net", "radio"):
         now[0] = wired({name: {}, **{each.name: {} for each in now[0].connections}})
         changes.touch()
