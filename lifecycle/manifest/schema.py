@@ -190,11 +190,61 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
     for key in each.instance:
         if key in known:
             continue
-        message, hint = f"cannot use the unknown key {quote(key)}", did_you_mean(key, known)
-        if not hint:
+        place, message = (*_place(each), key), f"cannot use the unknown key {quote(key)}"
+        meant, where = did_you_mean(key, known), _elsewhere(place)
+        if not meant and (not where or len(known) <= _FEW):
             message = f"{message}; allowed: {', '.join(known)}"
-        place = (*_place(each), key)
+        hint = meant or where
         yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
+
+
+_FEW = 5
+"""So many keys are listed also where a better place for an unknown one is named."""
+
+_NAME = "NAME"
+"""What stands in a place for a name that users choose, and for a number in a list."""
+
+
+def _elsewhere(place: Place) -> str:
+    """Return where a manifest has a key that is unknown where it stands; empty if nowhere."""
+
+    def likeness(known: tuple[str, ...]) -> tuple[int, int, int]:
+        pairs = itertools.takewhile(
+            lambda two: two[1] in (two[0], _NAME), zip(place, known, strict=False)
+        )
+        return len([*pairs]), len({*place} & {*known}), -len(known)
+
+    found = [each for each in _places() if each[-1] == place[-1]]
+    if not found:
+        return ""
+    nearest_one = max(found, key=likeness)
+    same = likeness(nearest_one)[0]
+    return f"it is a key of {'.'.join(map(str, (*place[:same], *nearest_one[same:-1])))}"
+
+
+@functools.cache
+def _places() -> tuple[tuple[str, ...], ...]:
+    """Return the place of each key that a manifest may have."""
+    whole = read_schema(MANIFEST)
+
+    def walk(
+        schema: Mapping[str, Any], place: tuple[str, ...], within: tuple[str, ...]
+    ) -> Iterator[tuple[str, ...]]:
+        name = schema.get("$ref", "").rpartition("/")[2]
+        if name in within:
+            return
+        if name:
+            schema, within = whole["$defs"][name], (*within, name)
+        for key, each in schema.get("properties", {}).items():
+            yield (*place, key)
+            yield from walk(each, (*place, key), within)
+        for keyword in ("additionalProperties", "items"):
+            if isinstance(each := schema.get(keyword), dict):
+                yield from walk(each, (*place, _NAME), within)
+        for each in itertools.chain(*(schema.get(keyword, ()) for keyword in _CHOICES)):
+            yield from walk(each, place, within)
+
+    return tuple(dict.fromkeys(walk(whole, (), ())))
 
 
 def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
