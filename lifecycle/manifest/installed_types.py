@@ -8,15 +8,12 @@ rosidl installs beside every definition. Imports no message package.
 
 from __future__ import annotations
 
-import enum
 import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
-
-import msgspec
 
 from lifecycle.errors import nearest
 
@@ -53,53 +50,29 @@ def list_resources(kind: str, prefixes: Sequence[Path]) -> tuple[str, ...]:
 _RESOURCE = "rosidl_interfaces"
 
 
-class TypeStatus(enum.Enum):
-    """What the index holds of a type."""
-
-    EXISTS = "exists"
-    NO_SUCH_TYPE = "no such type"  # the package is installed, the type is not in it
-    NOT_INSTALLED = "package not installed"
-
-
-class TypeLookup(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer for one type.
-
-    Attributes:
-        nearest: an installed type (NO_SUCH_TYPE) or package (NOT_INSTALLED) with a similar name;
-            empty if there is none.
-    """
-
-    status: TypeStatus
-    nearest: str = ""
-
-
-def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
-    """Look a type up, `package/msg/Type`, in the prefixes of `search_prefixes`."""
-    package, _, name = type_.partition("/")
+def types_of(package: str, prefixes: Sequence[Path]) -> tuple[str, ...] | None:
+    """Return what a package declares, `msg/Image`, each once; None if it is not installed."""
     found = find_resource(_RESOURCE, package, prefixes)
-    if found is None:
+    lines = () if found is None else found.read_text(encoding="utf-8").split()
+    types = tuple(dict.fromkeys(str(PurePosixPath(line).with_suffix("")) for line in lines))
+    return None if found is None else types
+
+
+def nearest_type(type_: str, prefixes: Sequence[Path]) -> str:
+    """Return the type of its package, else the package, with a similar name; empty without one."""
+    package, _, name = type_.partition("/")
+    types = types_of(package, prefixes)
+    if types is None:
         import difflib  # only a mistake needs it
 
         # Packages share endings (`_msgs`, `_interfaces`), so only a near miss is a hint.
         known = list_resources(_RESOURCE, prefixes)
-        similar = next(iter(difflib.get_close_matches(package, known, n=1, cutoff=0.85)), "")
-        return TypeLookup(status=TypeStatus.NOT_INSTALLED, nearest=similar)
-    types = _types(found)
-    if name in types:
-        return TypeLookup(status=TypeStatus.EXISTS)
+        return next(iter(difflib.get_close_matches(package, known, n=1, cutoff=0.85)), "")
     # A type of the same kind is preferred: `msg/Imu` for `msg/IMU`, not `srv/SetCameraInfo`.
     kind = name.partition("/")[0]
     same_kind = [each for each in types if each.startswith(f"{kind}/")]
     similar = nearest(name, same_kind) or nearest(name, types)
-    return TypeLookup(
-        status=TypeStatus.NO_SUCH_TYPE, nearest=f"{package}/{similar}" if similar else ""
-    )
-
-
-def _types(resource: Path) -> tuple[str, ...]:
-    """Return what a package declares: `msg/Image`, each once, in the index's order."""
-    lines = resource.read_text(encoding="utf-8").split()
-    return tuple(dict.fromkeys(str(PurePosixPath(line).with_suffix("")) for line in lines))
+    return f"{package}/{similar}" if similar else ""
 
 
 _SERVICE = ("_Request", "_Response")

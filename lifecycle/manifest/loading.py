@@ -98,30 +98,20 @@ def load(
     loading = _Loading(variables, Programs(variables) if run_commands else None)
     loading.read(Path(path), arguments)
     manifest, found = loading.manifest(), loading.found
-
-    def every() -> tuple[Diagnostic, ...]:
-        return in_order(found, loading.files)
-
     if manifest is None or _has_errors(found):
-        raise ManifestError(every())
+        raise ManifestError(in_order(found, loading.files))
     files = ParameterFiles(manifest.path)
     manifest = settle(_without_left_out(manifest), files, found)
     if not manifest.nodes and manifest.left_out:
         at = Position(file=manifest.path, line=1, column=1)
         message = "cannot run a system without nodes: conditions leave out all of them"
-        found.append(
-            error(
-                "manifest.condition",
-                at,
-                message,
-                "lifecycle check --arguments lists what they follow",
-            )
-        )
+        hint = "lifecycle check --arguments lists what they follow"
+        found.append(error("manifest.condition", at, message, hint))
     if not _has_errors(found):
         found += check(manifest, environment=variables, files=files)
+    warnings = in_order(found, loading.files)
     if _has_errors(found):
-        raise ManifestError(every())
-    warnings = every()
+        raise ManifestError(warnings)
     unproven = tuple(each for each in warnings if each.is_unproven)
     manifest = replace(manifest, unproven=unproven)
     return Loaded(manifest=manifest, warnings=warnings, files=files)

@@ -126,10 +126,12 @@ def settle(manifest: Manifest, files: ParameterFiles, found: Findings) -> Manife
         if node.process:
             for key, value in _own_supervision(node).items():
                 own.setdefault(node.process, {}).setdefault(key, value)
-    nodes = tuple(
-        _settled(_as_its_process(node, own.get(node.process, {})), files) for node in manifest.nodes
-    )
-    return replace(manifest, nodes=nodes)
+    nodes = []
+    for node in manifest.nodes:
+        said = {**own.get(node.process, {}), **_own_supervision(node)}
+        supervised = replace(node, supervision=replace(node.supervision, **said))
+        nodes.append(_settled(supervised, files))
+    return replace(manifest, nodes=tuple(nodes))
 
 
 def _for_no_node(nodes: Iterable[Node]) -> Iterator[Diagnostic]:
@@ -156,24 +158,14 @@ def _own_supervision(node: Node) -> dict[str, object]:
     return {key: getattr(node.supervision, key) for key in SUPERVISION_KEYS if key in written}
 
 
-def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
-    values = {**process, **_own_supervision(node)}
-    supervision = replace(node.supervision, **values)
-    return replace(node, supervision=supervision) if process else node
-
-
 def _settled(node: Node, files: ParameterFiles) -> Node:
     shared = {name for name, _ in node.parameters if f"parameters.{name}" in node.shared}
     if not shared:
         return node
-    if node.interface.parameters:
-        declared = {each.name for each in node.interface.parameters}
-        kept = {name for name in shared if name in declared or is_implicit(name)}
-    else:
-        kept = set(shared)
-    if kept:
-        kept -= {name for name, _, _ in files.given(node)}
-    gone = shared - kept
+    declared = {each.name for each in node.interface.parameters}
+    gone = {name for name in shared if declared and name not in declared and not is_implicit(name)}
+    if gone != shared:
+        gone |= shared & {name for name, _, _ in files.given(node)}
     return replace(
         node,
         parameters=tuple(each for each in node.parameters if each[0] not in gone),

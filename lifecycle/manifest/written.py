@@ -52,6 +52,31 @@ Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namesp
 Prefix = Annotated[
     str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
 ]
+ConnectionName = Annotated[
+    str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
+]
+PythonName = Annotated[
+    str,
+    spelled(
+        rf"^{WORD}(\.{WORD})*:{WORD}\Z",
+        "write module:Class, as in examples.teleop.nodes:Camera",
+    ),
+    Meta(examples=["examples.teleop.nodes:Camera"]),
+]
+Plugin = Annotated[
+    str,
+    spelled(
+        rf"^[A-Za-z][A-Za-z0-9_]*/{WORD}(::{WORD})*\Z",
+        "write package/Plugin, as in image_tools/image_tools::Cam2Image",
+    ),
+    Meta(examples=["image_tools/image_tools::Cam2Image"]),
+]
+Keyword = Annotated[
+    str, spelled(rf"^{WORD}\Z", "name an argument: letters, digits and '_', not a digit first")
+]
+Variable = Annotated[
+    str, spelled(rf"^{WORD}\Z", "name an environment variable: letters, digits and '_'")
+]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Scalar = str | int | float | bool
@@ -239,57 +264,17 @@ class Run(ProcessKeys, frozen=True, kw_only=True):
         ("attach",),
     )
 
-    python: (
-        Annotated[
-            str,
-            spelled(
-                rf"^{WORD}(\.{WORD})*:{WORD}\Z",
-                "write module:Class, as in examples.teleop.nodes:Camera",
-            ),
-            Meta(examples=["examples.teleop.nodes:Camera"]),
-        ]
-        | None
-    ) = None
-    arguments: (
-        dict[
-            Annotated[
-                str,
-                spelled(
-                    rf"^{WORD}\Z", "name an argument: letters, digits and '_', not a digit first"
-                ),
-            ],
-            Values,
-        ]
-        | None
-    ) = None
+    python: PythonName | None = None
+    arguments: dict[Keyword, Values] | None = None
     executor: Executor = Executor.SINGLE
     threads: Annotated[int, Meta(ge=1, le=256)] | None = None
     command: Annotated[tuple[Scalar, ...], Meta(min_length=1)] | None = None
     package: Text | None = None
     executable: Text | None = None
     attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
-    environment: (
-        dict[
-            Annotated[
-                str,
-                spelled(rf"^{WORD}\Z", "name an environment variable: letters, digits and '_'"),
-            ],
-            Scalar,
-        ]
-        | None
-    ) = None
+    environment: dict[Variable, Scalar] | None = None
     working_directory: Text | None = None
-    component: (
-        Annotated[
-            str,
-            spelled(
-                rf"^[A-Za-z][A-Za-z0-9_]*/{WORD}(::{WORD})*\Z",
-                "write package/Plugin, as in image_tools/image_tools::Cam2Image",
-            ),
-            Meta(examples=["image_tools/image_tools::Cam2Image"]),
-        ]
-        | None
-    ) = None
+    component: Plugin | None = None
     container: Annotated[Text, Meta(examples=["container", "/robot/container"])] | None = None
     extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
     prefix: (
@@ -505,7 +490,7 @@ class Ready(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameter: Text | Annotated[dict[Text, ParameterTree], Meta(min_length=1)] | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless something shows it."""
+        """Raise ValueError unless one of its sets of keys is written."""
         require(_written(self, self.ANY_OF) > 0)
 
 
@@ -608,13 +593,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     timeouts: Timeouts = Timeouts()
     interface: Interface | InterfaceReference | None = None
     flows: Flows = Flows()
-    connections: dict[
-        Annotated[
-            str,
-            spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first"),
-        ],
-        Connection,
-    ] = field(default_factory=dict)
+    connections: dict[ConnectionName, Connection] = field(default_factory=dict)
     endpoints: EndpointPolicy = EndpointPolicy.DECLARED
     log_level: Literal["debug", "info", "warn", "error", "fatal"] | None = None
     on_violation: OnViolation | None = None
@@ -623,7 +602,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     may_end: bool = False
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless it is said in one way how it is started."""
+        """Raise ValueError unless exactly one way to start is written."""
         require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
@@ -676,7 +655,7 @@ class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True)
     include: tuple[Include, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError where there can be no nodes."""
+        """Raise ValueError unless one of its sets of keys is written."""
         require(_written(self, self.ANY_OF) > 0)
 
 

@@ -5,19 +5,20 @@ QoS is judged by the rule of `lifecycle.manifest.qos`; types are looked up in th
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterator
 
 import msgspec
 
 from lifecycle.errors import did_you_mean
+from lifecycle.manifest import installed_types
 from lifecycle.manifest.checks.system import (
     DeclaredSystem,
     Resolved,
     implicit_names,
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, warning
-from lifecycle.manifest.installed_types import TypeLookup, TypeStatus, look_up
 from lifecycle.manifest.model import (
     Authority,
     ConnectionDeclaration,
@@ -277,19 +278,21 @@ def check_types(system: DeclaredSystem) -> Iterator[Diagnostic]:
 
 
 def _missing(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    answers: dict[str, TypeLookup] = {}
+    types_of = functools.cache(lambda package: installed_types.types_of(package, system.prefixes))
     absent: set[str] = set()
     for node in system.manifest.nodes:
         for endpoint in node.interface.endpoints:
             type_ = endpoint.type
-            if type_ not in answers:
-                answers[type_] = look_up(type_, system.prefixes)
-            answer, package = answers[type_], type_.partition("/")[0]
-            hint = f"did you mean {answer.nearest!r}?" if answer.nearest else ""
-            if answer.status is TypeStatus.NO_SUCH_TYPE:
+            package, _, name = type_.partition("/")
+            types = types_of(package)
+            if package in absent or (types is not None and name in types):
+                continue
+            nearest = installed_types.nearest_type(type_, system.prefixes)
+            hint = f"did you mean {nearest!r}?" if nearest else ""
+            if types is not None:
                 message = f"cannot find type {type_!r}: package {package!r} has no such type"
                 yield error("check.type-unknown", endpoint.at, message, hint)
-            elif answer.status is TypeStatus.NOT_INSTALLED and package not in absent:
+            else:
                 # Once per package: the answer is the same for all of its types.
                 absent.add(package)
                 message = f"cannot tell whether {type_!r} exists: {package!r} is not installed here"

@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.installed_types import (
-    TypeLookup,
-    TypeStatus,
     find_resource,
     list_resources,
-    look_up,
+    nearest_type,
     search_prefixes,
+    types_of,
 )
 
 INDEX = Path("share", "ament_index", "resource_index")
@@ -32,8 +31,7 @@ def prefix(tmp_path: Path) -> Path:
 
 
 def test_a_declared_type_exists(prefix: Path) -> None:
-    assert look_up("sensor_msgs/msg/Image", [prefix]) == TypeLookup(status=TypeStatus.EXISTS)
-    assert look_up("sensor_msgs/srv/SetCameraInfo", [prefix]).status is TypeStatus.EXISTS
+    assert types_of("sensor_msgs", [prefix]) == ("msg/Image", "msg/Imu", "srv/SetCameraInfo")
 
 
 @pytest.mark.parametrize(
@@ -49,16 +47,15 @@ def test_a_declared_type_exists(prefix: Path) -> None:
 def test_a_type_that_its_package_lacks_names_the_nearest_spelling(
     prefix: Path, type_: str, nearest: str
 ) -> None:
-    assert look_up(type_, [prefix]) == TypeLookup(status=TypeStatus.NO_SUCH_TYPE, nearest=nearest)
+    assert nearest_type(type_, [prefix]) == nearest
 
 
 @pytest.mark.parametrize(("package", "nearest"), [("sensr_msgs", "sensor_msgs"), ("zzz", "")])
 def test_a_package_that_is_not_installed_is_told_apart(
     prefix: Path, package: str, nearest: str
 ) -> None:
-    assert look_up(f"{package}/msg/Image", [prefix]) == TypeLookup(
-        status=TypeStatus.NOT_INSTALLED, nearest=nearest
-    )
+    assert types_of(package, [prefix]) is None
+    assert nearest_type(f"{package}/msg/Image", [prefix]) == nearest
 
 
 def test_the_first_prefix_that_has_the_package_decides(prefix: Path, tmp_path: Path) -> None:
@@ -66,8 +63,7 @@ def test_the_first_prefix_that_has_the_package_decides(prefix: Path, tmp_path: P
     folder = overlay / INDEX / "rosidl_interfaces"
     folder.mkdir(parents=True)
     (folder / "sensor_msgs").write_text("msg/Own.msg\n")
-    assert look_up("sensor_msgs/msg/Own", [overlay, prefix]).status is TypeStatus.EXISTS
-    assert look_up("sensor_msgs/msg/Image", [overlay, prefix]).status is TypeStatus.NO_SUCH_TYPE
+    assert types_of("sensor_msgs", [overlay, prefix]) == ("msg/Own",)
 
 
 def test_prefixes_are_the_variable_and_then_the_python_environment() -> None:
@@ -85,8 +81,8 @@ def test_resources_are_listed_without_hidden_files(prefix: Path) -> None:
 def test_looking_a_type_up_imports_no_message_package() -> None:
     code = (
         "import sys; from lifecycle.manifest.installed_types import search_prefixes\n"
-        "from lifecycle.manifest.installed_types import look_up\n"
-        "look_up('sensor_msgs/msg/Image', search_prefixes())\n"
+        "from lifecycle.manifest.installed_types import types_of\n"
+        "types_of('sensor_msgs', search_prefixes())\n"
         "sys.exit(bool({'rclpy', 'sensor_msgs', 'ament_index_python'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
