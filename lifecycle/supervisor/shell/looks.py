@@ -190,9 +190,11 @@ class Looks:
                 self._asked, self._again_s = run.asked, ASK_AGAIN_S
             again_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
-        if run.change is not None and authority is not None and authority.is_at_work():
-            # The authority has still to make what running nodes lack.
-            awaited_s.append(ASK_AGAIN_AT_MOST_S)
+        if authority is not None:
+            again_s.append(authority.again_s)
+            if run.change is not None and authority.is_at_work():
+                # The authority has still to make what running nodes lack.
+                awaited_s.append(ASK_AGAIN_AT_MOST_S)
         return messages.Verified(
             mark=mark,
             verdict=verdict,
