@@ -249,7 +249,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if target is Level.ACTIVE:
         passage = run.passage
         passes = passage is not None and passage.opened and node.key in passage.waiting
-        if not passes or run.is_changing or run.switch is not None or not gate.is_open(run):
+        if not passes or run.is_changing or not gate.is_open(run):
             return None
     if target is Level.CONNECTED and run.wires and not node.wired:
         return Step.WIRE
