@@ -4,20 +4,20 @@ Owns: when nodes are wired and how often again. What each node must have, and wh
 instructions.py's; requests to a node are driver.py's. Must not import rclpy.
 
 Everything is level-triggered: each look compares desired with observed state, so that a lost
-connection, a new endpoint and the first wiring are one case.
+connection, a new endpoint and the first wiring are one case; what is due later is due at a look.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import ended, set_within, within
-from lifecycle.manifest.model import Authority
+from lifecycle.graph.loop import ended
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.instructions import (
@@ -29,20 +29,20 @@ from lifecycle.supervisor.connections.instructions import (
     steps,
     wired,
 )
-from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.core.state import NEVER_S, Level
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
     NodeDriver,
     NodeInterfaceClient,
 )
-from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.supervisor.nodes.system import NodeRun
+    from lifecycle.supervisor.shell.supervisor import Supervisor
 
 AGAIN_S = 0.1
 """What was lost is made again at once; the next try comes so long after, then twice as long ..."""
@@ -58,15 +58,6 @@ RELEASE_S = 2.0
 
 CALM_S = 10.0
 """A node that stayed wired for so long has its tries back."""
-
-
-def authority_of(system: System, participant: ObserverParticipant) -> ConnectionAuthority | None:
-    """Return who wires `system`; None if its nodes do it themselves."""
-    layer = system.plan.data_layer
-    if layer.authority is not Authority.SUPERVISOR:
-        return None
-    negotiated = NegotiatedSource(system.plan) if is_negotiated(system.plan) else None
-    return ConnectionAuthority(system, negotiated, participant)
 
 
 class _Wiring(msgspec.Struct):
@@ -91,31 +82,23 @@ class _Wiring(msgspec.Struct):
 class ConnectionAuthority:
     """Wires the nodes of one supervisor, and those that joined without being declared.
 
-    Args:
-        system: whose nodes.
-        negotiated: what they must have, where the manifest alone does not say it.
-        participant: reaches nodes that are not declared.
+    Attributes:
+        again_s: seconds after which it has to look again; for ever if nothing is due.
     """
 
-    def __init__(
-        self,
-        system: System,
-        negotiated: NegotiatedSource | None,
-        participant: ObserverParticipant,
-    ) -> None:
-        self._system = system
-        self._negotiated = negotiated
-        self._participant = participant
+    def __init__(self, shell: Supervisor) -> None:
+        self._shell = shell
+        self._system = shell.system
+        plan = shell.system.plan
+        self._negotiated = NegotiatedSource(plan) if is_negotiated(plan) else None
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
         self._instructions: Mapping[str, Instructions] = {}
-        self._making = 0
-        self._wake = asyncio.Event()
-        self._following: asyncio.Task[None] | None = None
+        self._making: dict[str, asyncio.Task[None]] = {}
         self._closed = False
-        layer = system.plan.data_layer
-        self._repairs = layer.events
-        self._follows = layer.events or negotiated is not None
+        self._repairs = plan.data_layer.events
+        self._follows = self._repairs or self._negotiated is not None
+        self.again_s = NEVER_S
 
     async def wire(self, node: NodeRun) -> None:
         """Make everything that a configured node must have before it connects.
@@ -148,18 +131,12 @@ class ConnectionAuthority:
         await self._make(node.name, steps(wanted, wiring.has))
 
     async def unwire(self, node: NodeRun) -> None:
-        """Unmake what a node was connected to, the last connection first, each bounded."""
-        wiring, limit_s = self._wirings.get(node.name), node.planned.timeouts.cleanup_s
-        while wiring is not None and wiring.ours and node.driver is not None:
-            name = wiring.ours.pop()
+        """Unmake what a node was connected to, the last connection first."""
+        wiring = self._wirings.get(node.name)
+        for name in reversed([] if wiring is None else wiring.ours.copy()):
             step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
-            try:
-                await within(limit_s, node.driver.wire(step))
-            except (BringUpError, asyncio.TimeoutError) as error:
-                text = str(error) or f"cannot {step} within {limit_s:g} s"
-                self._system.emit(Notice(message=text))
-            else:
-                self._system.emit(_done(step))
+            with contextlib.suppress(BringUpError):  # the step's own event says why
+                await self._make(node.name, [step])
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
@@ -185,17 +162,15 @@ class ConnectionAuthority:
         for problem in self._problems():
             if problem not in before:
                 self._system.emit(Notice(message=problem))
-        self._wake.set()
-        if self._following is None and not self._closed:
-            self._following = asyncio.ensure_future(self._follow())
+        self.again_s = NEVER_S
+        for said, has, missing in () if self._closed else self._lacking():
+            if self._is_due(said, has, missing):
+                self._making[said.name] = self._shell.start(self._repair(said.name, has, missing))
 
     async def close(self) -> None:
         """Stop following, and disconnect what was made on nodes that are not declared."""
         self._closed = True
-        if self._following is not None:
-            if self._following.done():
-                self._following.result()
-            await ended(self._following)
+        await ended(*self._making.values())
         for name, wiring in tuple(self._wirings.items()):  # nodes leave meanwhile
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
@@ -224,7 +199,7 @@ class ConnectionAuthority:
         """
         if not self._follows:
             return False
-        return bool(self._making) or any(
+        return any(not each.done() for each in self._making.values()) or any(
             missing and self._wiring(said.name).given_up != said.checksum
             for said, _, missing in self._lacking()
         )
@@ -247,12 +222,6 @@ class ConnectionAuthority:
     def _problems(self) -> tuple[str, ...]:
         return () if self._negotiated is None else self._negotiated.problems
 
-    async def _follow(self) -> None:
-        while True:
-            self._wake.clear()
-            waits_s = [await self._repair(*each) for each in self._lacking()]
-            await set_within(self._wake, min(filter(None, waits_s), default=None))
-
     def _lacking(
         self,
     ) -> Iterator[tuple[NodeConfiguration, Instructions, tuple[Command, ...]]]:
@@ -272,34 +241,39 @@ class ConnectionAuthority:
             has = wired(said) if self._repairs or node is None else wiring.has
             yield said, has, steps(wanted, has, ours=wiring.ours)
 
-    async def _repair(
+    def _is_due(
         self, said: NodeConfiguration, has: Instructions, missing: tuple[Command, ...]
-    ) -> float | None:
-        """Wire a node that lacks something; return after how many seconds to try again."""
-        wiring = self._wiring(said.name)
+    ) -> bool:
+        """Return whether a node lacks something that is to be made now."""
+        wiring, making = self._wiring(said.name), self._making.get(said.name)
+        if making is not None and not making.done():
+            return False
         if not missing:
             wiring.has, wiring.error = has, ""
-            return None
+            return False
+        now_s = self._shell.now_s()
         if wiring.given_up == said.checksum:
-            return None
-        now_s = asyncio.get_running_loop().time()
+            return False
         if wiring.given_up is not None or now_s - wiring.last_s > CALM_S:
             wiring.rounds, wiring.given_up = 0, None
+        elif wiring.rounds >= TRIES:
+            wiring.given_up = said.checksum
+            return False
         due_s = wiring.last_s + _backoff_s(wiring.rounds)
         if now_s < due_s:
-            return due_s - now_s
+            self.again_s = min(self.again_s, due_s - now_s)
+        return now_s >= due_s
+
+    async def _repair(self, name: str, has: Instructions, missing: tuple[Command, ...]) -> None:
+        wiring = self._wiring(name)
         self._say_lost(wiring, has)
         wiring.rounds += 1
-        wiring.last_s, wiring.has, wiring.error = now_s, has, ""
+        wiring.last_s, wiring.has, wiring.error = self._shell.now_s(), has, ""
         try:
-            await self._make(said.name, missing)
+            await self._make(name, missing)
         except BringUpError as error:
             wiring.error = error.message
-        if wiring.rounds >= TRIES:
-            wiring.given_up = said.checksum
-            return None
-        # Also after a success: one that does not show in the node's own report is none.
-        return _backoff_s(wiring.rounds)
+        self._system.touch()  # a success that does not show in the node's own report is none
 
     def _say_lost(self, wiring: _Wiring, has: Instructions) -> None:
         there, mapped, name = dict(has.connections), dict(has.mappings), has.node
@@ -314,18 +288,16 @@ class ConnectionAuthority:
         """Make steps of a node in order; the first that fails ends it."""
         node, wiring = self._system.node_named(name), self._wiring(name)
         interface: NodeDriver | NodeInterfaceClient | None = node.driver if node else None
-        interface = interface or NodeInterfaceClient(self._participant.clients, name)
+        interface = interface or NodeInterfaceClient(self._shell.means.participant.clients, name)
         for step in missing:
             if node is not None:
                 node.wiring = str(step)
-            self._making += 1
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
                 self._system.emit(_done(step, attempt=wiring.rounds, error=error.message))
                 raise
             finally:
-                self._making -= 1
                 if node is not None:
                     node.wiring = ""
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:

@@ -249,7 +249,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if target is Level.ACTIVE:
         passage = run.passage
         passes = passage is not None and passage.opened and node.key in passage.waiting
-        if not passes or run.is_changing or run.switch is not None or not gate.is_open(run):
+        if not passes or run.is_changing or not gate.is_open(run):
             return None
     if target is Level.CONNECTED and run.wires and not node.wired:
         return Step.WIRE
@@ -305,12 +305,10 @@ def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
         limit_s=NEVER_S if appears else limit_of(node.planned, step),
         own_s=OWN_S if theirs else 0.0,
     )
-    if step is not Step.ACTIVATE:
-        return messages.Ask(node=node.key, step=step, number=run.requests)
-    assert run.passage is not None
-    run.passage.sent.add(node.key)
-    node.let_through = True
-    return messages.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
+    if step is Step.ACTIVATE and run.passage is not None:
+        run.passage.sent.add(node.key)
+        node.let_through = True
+    return messages.Ask(node=node.key, step=step, number=run.requests)
 
 
 def late_at_s(request: Request) -> float:

@@ -234,17 +234,14 @@ class Sweep(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Ask(msgspec.Struct, frozen=True, kw_only=True):
-    """Ask a node for a step; `Replied`.
+    """Ask a node for a step; `Replied` with its number: one that was given up is nobody's.
 
-    Attributes:
-        number: given back in the answer: one to a request that was given up is nobody's.
-        mark: for ACTIVATE: it may leave only while this is the run's mark, else `Replied(changed)`.
+    ACTIVATE may leave only while the gate is open, else `Replied(changed)`.
     """
 
     node: str
     step: Step
     number: int
-    mark: int = -1
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):

@@ -45,7 +45,7 @@ def _arrive(run: Run) -> list[Event]:
     if passage is None or passage.at_gate:
         return []
     coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
-    if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
+    if run.is_changing or coming or not advance.is_at_gate(run):
         return _late(run, "nothing was started") if run.is_past(passage.until_s) else []
     left_s = passage.until_s - run.now_s
     fresh_s = run.timeout_s if run.held_s is not None else run.options.gate_s(left_s)

@@ -617,8 +617,8 @@ class Run(msgspec.Struct, kw_only=True):
 
     @property
     def is_changing(self) -> bool:
-        """Whether a manifest is being changed to, or back to, and is not in force yet."""
-        return self.change is not None and not self.change.taken
+        """Whether a manifest or mode is being changed to, or back to, and is not in force yet."""
+        return self.switch is not None or (self.change is not None and not self.change.taken)
 
     @property
     def is_watched(self) -> bool:

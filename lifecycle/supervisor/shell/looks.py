@@ -106,7 +106,7 @@ class Looks:
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
         self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
         self._active_far: dict[str, float] = {}  # nodes of other machines, and since when
-        self._again: asyncio.TimerHandle | None = None
+        self._passing_s = NEVER_S  # until one of them may not pass any more
 
     @property
     def is_behind(self) -> bool:
@@ -121,8 +121,6 @@ class Looks:
     def close(self) -> None:
         """Judge no more."""
         self._standstill.close()
-        if self._again is not None:
-            self._again.cancel()
 
     async def look(self, _: messages.Look) -> None:
         """Look and judge, once a burst of changes is over."""
@@ -171,7 +169,7 @@ class Looks:
     ) -> messages.Verified:
         run, authority = self._system.run, self._shell.authority
         now_s = asyncio.get_running_loop().time()
-        verdict, awaited_s, again_s = found, list[float](), list[float]()
+        verdict, awaited_s, again_s = found, list[float](), [self._passing_s]
         watched = run.held_s is not None and run.asked is None and run.opening is None
         if watched:
             verdict, kept_s = self._grace_period.after(
@@ -189,13 +187,15 @@ class Looks:
                 self._asked, self._again_s = run.asked, ASK_AGAIN_S
             again_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
-        if run.change is not None and authority is not None and authority.is_at_work():
-            # The authority has still to make what running nodes lack.
-            awaited_s.append(ASK_AGAIN_AT_MOST_S)
+        if authority is not None:
+            again_s.append(authority.again_s)
+            if run.change is not None and authority.is_at_work():
+                # The authority has still to make what running nodes lack.
+                awaited_s.append(ASK_AGAIN_AT_MOST_S)
         return messages.Verified(
             mark=mark,
             verdict=verdict,
-            again_s=min((*awaited_s, *again_s), default=NEVER_S),
+            again_s=min(*awaited_s, *again_s, NEVER_S),
             waits=bool(awaited_s),
             away=away,
         )
@@ -289,8 +289,7 @@ class Looks:
         Over TCP an end counts a peer that was killed until its lease runs out, and nothing can
         take it away before. Behind the gate a newcomer has DISCOVERED_S to be discovered.
         """
-        loop = asyncio.get_running_loop()
-        now_s = loop.time()
+        now_s = asyncio.get_running_loop().time()
         self._left = {topic: at for topic, at in self._left.items() if at > now_s}
         found = {each.key: each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
         self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
@@ -299,11 +298,9 @@ class Looks:
             least_s = since_s + DISCOVERED_S if stage is Stage.ACTIVE else now_s
             until_s[key] = max(least_s, self._left.get(found[key].subject, now_s))
         passing = {key: at for key, at in until_s.items() if at > now_s}
+        self._passing_s = min(passing.values(), default=NEVER_S) - now_s
         if not passing:
             return verdict
-        if self._again is not None:
-            self._again.cancel()
-        self._again = loop.call_at(min(passing.values()), self._system.touch)
         dropped = [found[key] for key in passing]
         return without_findings(verdict, dropped, self._system.expected.policy)
 

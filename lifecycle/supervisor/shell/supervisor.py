@@ -23,7 +23,7 @@ from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.authority import authority_of
+from lifecycle.supervisor.connections.authority import ConnectionAuthority
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
@@ -128,7 +128,7 @@ class Supervisor:
         self.moved = asyncio.Event()
         self.changed = asyncio.Event()
         self.again: set[str] = set()
-        self.authority = authority_of(system, means.participant)
+        self.authority = ConnectionAuthority(self) if system.run.wires else None
         self.peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
         self._processes = Processes(self)

@@ -14,9 +14,11 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import Health, Machine, Quantity
 from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Delays, Measured, Sample
+from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.peers import Peers
-from lifecycle.supervisor.shell.looks import HEALTH_S, Looks, without
+from lifecycle.supervisor.shell import looks as shell_looks
+from lifecycle.supervisor.shell.looks import DISCOVERED_S, HEALTH_S, Looks, without
 from lifecycle.supervisor.shell.settling import PASSING_S
 from lifecycle.verify.observation import (
     HealthReport,
@@ -244,3 +246,19 @@ def test_a_dead_node_is_gone_although_discovery_shows_it_and_a_second_one_stays(
     assert [(each.full_name, each.count) for each in left.nodes] == [("/viewer", 1), ("/arm", 1)]
     assert (left.endpoints, left.configurations, left.parameters) == ((), (), ())
     assert without(seen, frozenset()) is seen
+
+
+async def test_an_unknown_peer_is_said_once_it_had_its_time_to_be_discovered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    said = "[verdict] active violated graph.unknown-peer"
+    async with world.running("[system] active"):
+        unknown = verdict(("graph.unknown-peer", "/video"))
+        monkeypatch.setattr(shell_looks, "verify", lambda *_, **__: unknown)
+        world.graph.note()
+        await asyncio.sleep(DISCOVERED_S - 0.2)
+        assert not any(each.startswith(said) for each in world.story)
+        await world.story.until(said)
+        assert asyncio.get_running_loop().time() == pytest.approx(DISCOVERED_S, abs=0.3)
+        await world.order(ControlRequest.DOWN)
