@@ -20,7 +20,7 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
-from lifecycle.plan.discovery import contacts_of, ports_of
+from lifecycle.plan.discovery import Hosts, contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -35,7 +35,6 @@ from lifecycle.plan.parties import (
     DataLayerGraph,
     NegotiatedConnection,
     Party,
-    hosts_of,
     party_of_node,
     terms_of,
     transports_of,
@@ -249,7 +248,7 @@ class NegotiatedSource:
     def _take(self, plan: Plan) -> None:
         self._plan = plan
         self._planned = {each.full_name: each for each in plan.nodes}
-        self._hosts = hosts_of(plan)
+        self._hosts = Hosts.of(plan)
         self._wishes = wishes_of(plan.flows)
         self._rmw = {
             key: dict(process.environment).get(_RMW, plan.rmw)
