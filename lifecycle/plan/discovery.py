@@ -53,19 +53,23 @@ class Hosts(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         machines: all that are declared.
         used: hosts that run something, in the order in which nodes name them.
+        server: the machine of the discovery server; empty without.
     """
 
     machines: tuple[Machine, ...]
     used: tuple[str, ...]
+    server: str
 
     @classmethod
-    def of(cls, machines: Sequence[Machine], names: Iterable[str]) -> Hosts:
-        """Return the hosts of a system; `names` are the machines that something runs on."""
-        addresses = {each.name: each.address for each in machines}
-        return cls(
-            machines=tuple(machines),
-            used=tuple(dict.fromkeys(addresses.get(name, "") for name in names)),
-        )
+    def of(cls, plan: Plan) -> Hosts:
+        """Return the hosts of a plan."""
+        server, names = "", [node.machine for node in plan.nodes]
+        if plan.discovery.mode is DiscoveryMode.SERVER:
+            first = next((each.name for each in plan.machines), "")
+            server = plan.discovery.server_machine or first
+            names.append(server)
+        used = dict.fromkeys(map(plan.address_of, names))
+        return cls(machines=plan.machines, used=tuple(used), server=server)
 
     def host(self, machine: str) -> str:
         """Return the host of a machine; this host for one that is not declared."""
@@ -308,7 +312,10 @@ def connect_control(
     server = None
     if discovery.mode is DiscoveryMode.SERVER:
         tcp = transport.medium is not None and transport.medium.is_tcp
-        server = _server(discovery, hosts, pool, tcp=tcp)
+        at = hosts.host(hosts.server)
+        server = PlannedServer(
+            machine=hosts.server, address=hosts.address(at), port=pool.take(at)[0], tcp=tcp
+        )
     ports = {host: pool.take(host, 4) for host in hosts.used}
     control = Control(
         transport=transport,
@@ -362,17 +369,6 @@ def connect_control(
         else node
         for node in nodes
     ), replace(control, observers={host: connected(("observer", host, "")) for host in hosts.used})
-
-
-def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) -> PlannedServer:
-    machine = discovery.server_machine or next((each.name for each in hosts.machines), "")
-    host = hosts.host(machine)
-    return PlannedServer(
-        machine=machine,
-        address=hosts.address(host),
-        port=pool.take(host)[0],
-        tcp=tcp,
-    )
 
 
 _Key = TypeVar("_Key")

@@ -205,14 +205,6 @@ def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, 
     return BUILTIN_TRANSPORTS.get(word or "DEFAULT", ())
 
 
-def hosts_of(plan: Plan) -> Hosts:
-    """Return the hosts of a plan."""
-    machines = [node.machine for node in plan.nodes]
-    if plan.server is not None:
-        machines.append(plan.server.machine)
-    return Hosts.of(plan.machines, machines)
-
-
 def rmw_of(node: PlannedNode, plan: Plan) -> str:
     """Return the RMW identifier that a node of a plan runs with."""
     return dict(node.run.environment).get("RMW_IMPLEMENTATION", "") or plan.rmw
@@ -220,7 +212,7 @@ def rmw_of(node: PlannedNode, plan: Plan) -> str:
 
 def terms_of(plan: Plan) -> Terms:
     """Return what the nodes of a plan can negotiate under, whatever they have negotiated so far."""
-    hosts, server = hosts_of(plan), plan.server
+    hosts, server = Hosts.of(plan), plan.server
     observers = {hosts.host(machine): each for machine, each in plan.observers}
     taken = written_ports(plan, hosts)
     for host, each in observers.items():

@@ -16,9 +16,9 @@ from msgspec.structs import replace
 
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, parse
 from lifecycle.network.ports import MAX_PORT
-from lifecycle.plan.discovery import PortPool, contacts_of
+from lifecycle.plan.discovery import Hosts, PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
-from lifecycle.plan.parties import hosts_of, terms_of
+from lifecycle.plan.parties import terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports
@@ -163,7 +163,7 @@ def _has_port(url: ConnectionUrl) -> bool:
 
 def _listeners(plan: Plan, reported: Reported = _NOTHING) -> dict[_Place, _Listener]:
     """Return every participant with a TCP port, in plan order, observers first."""
-    hosts = hosts_of(plan)
+    hosts = Hosts.of(plan)
     found: dict[_Place, _Listener] = {}
 
     def listen(place: _Place, machine: str, urls: Iterable[str]) -> None:

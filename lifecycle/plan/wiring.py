@@ -146,11 +146,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
             are not enough ports.
     """
     discovery, data_layer = plan.discovery, plan.data_layer
-    machines = [node.machine for node in plan.nodes]
-    if discovery.mode is DiscoveryMode.SERVER:
-        first = next((each.name for each in plan.machines), "")
-        machines.append(discovery.server_machine or first)
-    hosts = Hosts.of(plan.machines, machines)
+    hosts = Hosts.of(plan)
     pool = PortPool(discovery.first_port, written_ports(plan, hosts))
     nodes, control = connect_control(plan.nodes, discovery, hosts, pool)
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:

@@ -71,6 +71,11 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     is_stranger: bool = False
     is_shown: bool = True
 
+    @property
+    def where(self) -> str:
+        """How messages name it: `the publisher of /video in /camera`."""
+        return f"the {self.kind.noun} of {self.name} in {self.node or 'an unknown node'}"
+
     @classmethod
     def of(cls, endpoint: ObservedEndpoint) -> SeenEndpoint:
         """Return one that is not declared."""

@@ -185,8 +185,8 @@ class _Builder:
             notes = [f"declared as {planned.type}"] if type_ not in ("", planned.type) else []
             notes += [each.report.error] if each.report and each.report.error else []
             presence = Presence.PRESENT if each.observed else self._absent
-            end = self._end(planned.kind, planned.resolved, each.node, presence, notes)
-            yield planned.kind, planned.resolved, type_ or planned.type, end
+            end = self._end(each.kind, each.name, each.node, presence, notes)
+            yield each.kind, each.name, type_ or planned.type, end
         for other in (*view.undeclared, *view.foreign, *view.unattributed):
             end = self._end(other.kind, other.name, other.node, Presence.UNDECLARED, [])
             yield other.kind, other.name, other.type, end

@@ -24,7 +24,7 @@ from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
 from lifecycle.node.host.control import Command, Operation
-from lifecycle.plan.discovery import contacts_of, ports_of
+from lifecycle.plan.discovery import Hosts, contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -39,7 +39,6 @@ from lifecycle.plan.parties import (
     DataLayerGraph,
     NegotiatedConnection,
     Party,
-    hosts_of,
     party_of_node,
     terms_of,
     transports_of,
@@ -345,7 +344,7 @@ class NegotiatedSource:
     def _take(self, plan: Plan) -> None:
         self._plan = plan
         self._planned = {each.full_name: each for each in plan.nodes}
-        self._hosts = hosts_of(plan)
+        self._hosts = Hosts.of(plan)
         self._wishes = wishes_of(plan.flows)
         self._rmw = {
             key: dict(process.environment).get(_RMW, plan.rmw)

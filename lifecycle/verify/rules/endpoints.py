@@ -90,7 +90,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=f"{word} of {node}",
             observed=f"no such {word}",
-            message=f"{node} has no {word} of {planned.resolved}, which is declared",
+            message=f"{node} has no {word} of {actual.name}, which is declared",
             hint=_remapped(actual),
         )
     seen = actual.observed or actual.report
@@ -99,15 +99,15 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=planned.type,
             observed=seen.type or "no type",
-            message=f"the {word} of {planned.resolved} in {node}"
-            f" is declared as {planned.type} and is {seen.type or 'of unknown type'}",
+            message=f"{actual.where} is declared as {planned.type} and is"
+            f" {seen.type or 'of unknown type'}",
         )
 
 
 def _remapped(actual: Actual) -> str:
     """Return which other name its node has the endpoint under; empty if it has none."""
-    planned, report = actual.planned, actual.report
-    if report is None or report.resolved == planned.resolved:
+    report = actual.report
+    if report is None or report.resolved == actual.name:
         return ""
     return (
         f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or was "
@@ -119,8 +119,7 @@ def _unseen(
     view: View, actual: Actual, known_ends: Counter[tuple[str, EndpointKind | None]]
 ) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
-    node, planned, report = actual.node, actual.planned, actual.report
-    word = actual.kind.noun
+    report = actual.report
     if report is None:
         reason = "discovery does not show it here, and its node does not report it"
     elif actual.observed is None:
@@ -128,16 +127,16 @@ def _unseen(
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = known_ends[planned.resolved, planned.kind.other_end]
+        known = known_ends[actual.name, actual.kind.other_end]
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return
         reason = f"it is matched with {report.matched}, of which {known} are known here"
     yield UNSEEN_ENDPOINT.on(
         actual,
-        expected=f"{word} of {node}",
+        expected=f"{actual.kind.noun} of {actual.node}",
         observed="not shown by discovery",
-        message=f"nothing shows the {word} of {planned.resolved} in {node}: {reason}",
+        message=f"nothing shows {actual.where}: {reason}",
     )
 
 
@@ -154,7 +153,7 @@ def _undeclared(view: View) -> Iterator[Finding]:
         similar = [
             each.planned
             for each in view.nodes[endpoint.node].actual
-            if each.planned.kind is endpoint.kind
+            if each.kind is endpoint.kind
             and each.planned.type == endpoint.type
             and each.observed is None
         ]
@@ -180,18 +179,16 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
     if part is None:
         return None
     for actual in view.nodes[endpoint.node].actual:
-        planned = actual.planned
-        if (planned.kind, planned.resolved) != part:
+        if (actual.kind, actual.name) != part:
             continue
-        expected = part_type(endpoint.name, planned.type)
+        expected = part_type(endpoint.name, actual.planned.type)
         if endpoint.type != expected:
             return TYPE_MISMATCH.on(
                 actual,
                 expected=expected,
                 observed=endpoint.type or "no type",
-                message=f"the {planned.kind.noun} of {planned.resolved} in"
-                f" {endpoint.node} has another type: {endpoint.name} must be {expected} and is"
-                f" {endpoint.type or 'of unknown type'}",
+                message=f"{actual.where} has another type: {endpoint.name} must be {expected}"
+                f" and is {endpoint.type or 'of unknown type'}",
             )
     return None
 
@@ -200,8 +197,7 @@ def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
     types: dict[tuple[str, str], dict[str, None]] = {}  # in plan order
     for actual in view.actual:
-        planned = actual.planned
-        types.setdefault((planned.kind.meets_in, planned.resolved), {})[planned.type] = None
+        types.setdefault((actual.kind.meets_in, actual.name), {})[actual.planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
@@ -309,13 +305,12 @@ def _at(end: SeenEndpoint) -> Position | None:
 
 def _differs(end: SeenEndpoint, expected: str, source: str) -> Finding:
     what, name, type_ = _place(end)
-    node = end.node or "an unknown node"
     return DEFINITION_DIFFERS.finding(
         outcome=Outcome.VIOLATED,
         subject=name,
         expected=f"{type_} as {expected}",
         observed=f"{type_} as {end.type_hash}",
-        message=f"the {end.kind.noun} of {name} in {node} has another definition: its {type_} is"
+        message=f"{end.where} has another definition: its {type_} is"
         f" not that of {source}; both have the name, so the {what} is matched and the data are not"
         " understood",
         at=_at(end),

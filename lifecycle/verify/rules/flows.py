@@ -148,9 +148,8 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
         actual,
         expected=_spell_connection(wanted),
         observed=_spell_connection(report.connection),
-        message=f"the {actual.kind.noun} of {actual.name} in"
-        f" {actual.node} is mapped onto {_spell_connection(report.connection)} and must be onto"
-        f" {_spell_connection(wanted)}",
+        message=f"{actual.where} is mapped onto {_spell_connection(report.connection)}"
+        f" and must be onto {_spell_connection(wanted)}",
     )
 
 
@@ -214,27 +213,25 @@ def is_missing(flow: FlowView) -> bool:
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
-    planned, report = actual.planned, actual.report
-    if planned.kind is not EndpointKind.SUBSCRIPTION or report is None or report.error:
+    report = actual.report
+    if actual.kind is not EndpointKind.SUBSCRIPTION or report is None or report.error:
         return
     if report.nfes == ():
         yield BROKEN_ENDPOINT.on(
             actual,
             expected="at least one network flow endpoint",
             observed="none",
-            message=f"nothing reaches the subscription of {planned.resolved} in"
-            f" {actual.node}: it has no network flow endpoint",
+            message=f"nothing reaches {actual.where}: it has no network flow endpoint",
         )
 
 
 def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
-    planned, report = actual.planned, actual.report
+    report = actual.report
     if actual.observed is None and report is None:
         return
     if report is not None and (report.error or report.nfes == ()):
         return  # not made, or broken: that is said already
-    word = planned.kind.noun
-    where = f"the {word} of {planned.resolved} in {actual.node}"
+    word, where = actual.kind.noun, actual.where
     unique = uniqueness.is_unique(actual)
     if unique is None:
         yield UNVERIFIABLE.on(
@@ -403,13 +400,12 @@ def _judge_dscp(actual: Actual) -> Iterator[Finding]:
     wanted, read = planned.dscp, report.dscp if report else None
     if wanted is None:
         return
-    where = f"the {planned.kind.noun} of {planned.resolved} in {actual.node}"
     if read is None:
         yield DSCP_UNVERIFIABLE.on(
             actual,
             expected=describe(wanted),
             observed="not read back",
-            message=f"nothing shows the DSCP of {where}: it was not read back",
+            message=f"nothing shows the DSCP of {actual.where}: it was not read back",
         )
     elif read != wanted:
         waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
@@ -418,7 +414,7 @@ def _judge_dscp(actual: Actual) -> Iterator[Finding]:
             outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
             expected=describe(wanted),
             observed=describe(read),
-            message=f"the sockets of {where} carry {describe(read)}"
+            message=f"the sockets of {actual.where} carry {describe(read)}"
             f" and not {describe(wanted)}{waived}",
             hint="" if planned.enforce_dscp else "see the node's log for the refused option",
         )

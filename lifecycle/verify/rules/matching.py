@@ -141,14 +141,12 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
     """
     if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
         return
-    unseen = Counter(
-        (each.planned.kind, each.planned.resolved) for each in view.actual if each.observed is None
-    )
+    unseen = Counter((each.kind, each.name) for each in view.actual if each.observed is None)
     if any(each.health is not None and each.health.diagnostics for each in view.plan.nodes):
         unseen[(EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC)] += 1  # the supervisor's own
     for actual in view.actual:
         report = actual.report
-        if report is None or not report.matched or not actual.planned.kind.is_topic:
+        if report is None or not report.matched or not actual.kind.is_topic:
             continue
         if not brings_up(actual.owner, view.machines):
             continue
@@ -163,9 +161,8 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
-            message=f"the {actual.kind.noun} of {actual.name} in {actual.node} "
-            f"is matched with more than the graph shows: it counts {report.matched}, and the graph "
-            f"shows {possible} that can match it",
+            message=f"{actual.where} is matched with more than the graph shows: it counts"
+            f" {report.matched}, and the graph shows {possible} that can match it",
         )
 
 
@@ -309,7 +306,7 @@ def _clients(view: View) -> Iterator[Finding]:
         map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
     )
     for client in view.actual:
-        kind = SERVER_OF.get(client.planned.kind)
+        kind = SERVER_OF.get(client.kind)
         # A client without a report has its own finding if it is ours; of others no more can be seen
         # than that both ends are there and of one type, as of their topics.
         if kind is None or client.observed is None or client.report is None:
@@ -338,7 +335,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
         reason = f"it has {count} servers, and the client does not report which it is matched with"
     else:
         return
-    name, node = client.planned.resolved, client.node
+    name, node = client.name, client.node
     says, state = "", "are not matched"
     if outcome is not Outcome.VIOLATED:
         says, state = "nothing proves that ", "are matched"
@@ -348,9 +345,8 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
         ends=(node, server),
         expected="matched",
         observed=reason,
-        message=f"{says}{node} → {server} {state} on"
-        f" {client.planned.kind.meets_in} {name}: {reason}",
+        message=f"{says}{node} → {server} {state} on {client.kind.meets_in} {name}: {reason}",
         at=client.planned.at,
         node=node,
-        endpoint=client.planned.kind,
+        endpoint=client.kind,
     )

@@ -371,22 +371,21 @@ def _unmeasured_at(
     How often something is published shows wherever it arrives; the rest is another thing in each
     flow.
     """
-    noun, topic = actual.planned.kind.noun, actual.planned.resolved
     reasons = [each.why_not(quantity) for each in flows]
     anywhere = {each.kind for each in bounds_of(quantity)} <= {Kind.RATE, Kind.SILENCE}
     why = next(filter(None, reasons), "")
     if not flows:
-        verb = "subscribes to" if actual.planned.kind is EndpointKind.PUBLISHER else "publishes"
+        verb = "subscribes to" if actual.kind is EndpointKind.PUBLISHER else "publishes"
         why = f"nothing that is there and declared {verb} it"
     if why and not (anywhere and "" in reasons):
         yield NOT_MEASURED.finding(
-            subject=topic,
+            subject=actual.name,
             expected=str(quantity),
             observed="not measured",
-            message=f"{quantity} of the {noun} of {topic} in {actual.node} is not measured: {why}",
+            message=f"{quantity} of {actual.where} is not measured: {why}",
             at=quantity.at,
             node=actual.node,
-            endpoint=actual.planned.kind,
+            endpoint=actual.kind,
         )
 
 

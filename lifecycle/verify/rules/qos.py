@@ -87,14 +87,12 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
             hidden.append((policy, want))
         elif have != want:
             differing.append((policy, want, have))
-    word = planned.kind.noun
-    where = f"the {word} of {planned.resolved} in {actual.node}"
     for policy, want, have in differing:
         yield QOS_DIFFERS.on(
             actual,
             expected=f"{policy} {want}",
             observed=f"{policy} {have}",
-            message=f"{where} has {policy} {have}, and is declared with {want}",
+            message=f"{actual.where} has {policy} {have}, and is declared with {want}",
         )
     if hidden:
         unknown.append((actual, hidden))
@@ -120,7 +118,7 @@ def _unverifiable(node: PlannedNode, unknown: _Unknown) -> Finding:
 
 
 def _spell_end(end: Actual) -> str:
-    return f"{end.planned.resolved} ({end.planned.kind.noun})"
+    return f"{end.name} ({end.kind.noun})"
 
 
 def _leaves_all(declared: QosProfile) -> bool:

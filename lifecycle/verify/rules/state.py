@@ -144,13 +144,12 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
     for actual in facts.actual:
         if actual.report is not None:
             continue
-        planned = actual.planned
-        word = planned.kind.noun
+        word = actual.kind.noun
         yield INCOMPLETE_REPORT.on(
             actual,
             expected=f"{word} in the report of {name}",
             observed="not mentioned",
-            message=f"{name} does not report the {word} of {planned.resolved}",
+            message=f"{name} does not report the {word} of {actual.name}",
         )
 
 

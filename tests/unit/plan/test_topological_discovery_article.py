@@ -28,11 +28,11 @@ from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
+from lifecycle.plan.discovery import Hosts
 from lifecycle.plan.model import Plan
 from lifecycle.plan.negotiate import negotiate
 from lifecycle.plan.parties import (
     DataLayerGraph,
-    hosts_of,
     party_of_node,
     terms_of,
     wishes_of,
@@ -151,7 +151,7 @@ def test_a_node_is_neither_a_process_nor_forced_to_share_one():
 
 def test_the_negotiator_says_the_same_of_nodes_that_report_themselves():
     plan = example(ARTICLE)
-    hosts = hosts_of(plan)
+    hosts = Hosts.of(plan)
     parties = [
         party_of(configured(plan, each.key), hosts.host(each.machine), planned=each)
         for each in plan.nodes
@@ -272,7 +272,7 @@ def pair(**rest: object) -> Plan:
 
 def negotiated(plan: Plan, *configurations: NodeConfiguration) -> str:
     """What carries /t from p to s, judged by what the nodes report."""
-    hosts = hosts_of(plan)
+    hosts = Hosts.of(plan)
     known = {each.name: each for each in configurations}
     parties = [
         party_of(known[each.full_name], hosts.host(each.machine), planned=each)
@@ -316,7 +316,7 @@ def test_a_link_overrides_the_nodes_hint_for_one_pair():
 
 def test_what_transports_do_you_support_is_answered_and_decides():
     plan = pair()
-    hosts = hosts_of(plan)
+    hosts = Hosts.of(plan)
     one, other = configured(plan, "p"), configured(plan, "s", transports=("tcpv4",))
     parties = [party_of(one, hosts.host("m1")), party_of(other, hosts.host("m2"))]
     assert [each.transports for each in parties] == [
@@ -335,7 +335,7 @@ def test_what_transports_do_you_support_is_answered_and_decides():
 
 def test_configurations_captured_statically_and_read_while_running_negotiate_the_same():
     plan = pair(needs=[need(PUB, "t", transport=FlowTransport.TCPV4)])
-    hosts = hosts_of(plan)
+    hosts = Hosts.of(plan)
     bare = {key: replace(plan.node(key), participants=()) for key in ("p", "s")}
     statically = [party_of_node(each, hosts, rmw=plan.rmw) for each in bare.values()]
     dynamically = [
