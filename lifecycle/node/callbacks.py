@@ -148,10 +148,7 @@ async def called(callback: Callable[..., Any], *arguments: object) -> Any:
 async def result_of(running: Running, *, what: str, deadline_s: float) -> Result:
     """Run a transition callback and return its result; never raises for what the user did.
 
-    Args:
-        running: it; whoever awaits this interrupts it at its deadline, where it awaits.
-        what: for messages, "/camera: on_configure".
-        deadline_s: seconds, > 0.
+    Whoever awaits this interrupts it at its deadline, where it awaits.
     """
     began = time.monotonic()
     await running

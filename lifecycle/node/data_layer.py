@@ -87,11 +87,7 @@ class DataLayer:
         """Have one more endpoint, made at once where the others are.
 
         What a manifest says of the same name is kept. The same line may declare the same again:
-        on_activate runs more than once.
-
-        Raises:
-            LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
-                declared already, it needs a handler, or it cannot be made.
+        on_activate runs more than once. Raises LifecycleError.
         """
         is_early = self._managed.state is NodeState.UNCONFIGURED
         if not is_early:
@@ -197,11 +193,8 @@ class DataLayer:
     def prepare(self, handlers: Mapping[Key, Callable[..., Any]]) -> None:
         """Import every type and make the publishers' handles; no endpoint exists yet.
 
-        Args:
-            handlers: decorated methods, of what has no handler in code.
-
-        Raises:
-            LifecycleError: types that are not installed, all of them at once.
+        Handlers are those of what has none in code. Raises LifecycleError with every type that is
+        not installed.
         """
         problems: list[str] = []
         for endpoint in self._declared.values():
@@ -246,9 +239,8 @@ class DataLayer:
     def make(self) -> None:
         """Map every endpoint that is mapped nowhere onto what the plan says, or none.
 
-        Raises:
-            ConnectError: the first endpoint that could not be made, with the RMW's reason; under an
-                authority, which maps them all, those that are not mapped.
+        Raises ConnectError with the RMW's reason; or, under an authority that maps them, with all
+        that are not mapped.
         """
         for endpoint in self.endpoints.values():
             endpoint.error = ""
@@ -416,11 +408,7 @@ class DataLayer:
         self._unplace(endpoint, placement)
 
     def _move(self, endpoint: Endpoint, connection: Connection, *, at_once: bool = False) -> Future:
-        """Make an endpoint on a connection, before it breaks where it was; raises LifecycleError.
-
-        Returns:
-            Done once it is nowhere else.
-        """
+        """Make an endpoint on a connection, before it breaks where it was; done once it has."""
         if endpoint.handover is not None:
             endpoint.handover.end()
         old, peers = endpoint.placement, _peers(endpoint)

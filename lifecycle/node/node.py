@@ -370,9 +370,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             endpoint: `video`, or `publishers/video` where another kind has the name too.
             lossy: the data bear an unreliable transport.
             size_bytes: the largest serialized message, > 0.
-
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
         """
         data_layer = self.lifecycle.data_layer
         data_layer.hint(data_layer.find(endpoint), lossy, size_bytes)
@@ -492,9 +489,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def remap(self, endpoint: str, name: str) -> None:
         """Give a declared endpoint another topic or service name; "" gives back its own.
 
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
-            LifecycleError: not a name; the endpoint is as it was.
+        Raises LifecycleError for what is not a name: the endpoint is as it was.
         """
         self.lifecycle.data_layer.remap(endpoint, name)
 
