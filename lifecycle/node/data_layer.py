@@ -34,7 +34,7 @@ from lifecycle.node.endpoint import (
 from lifecycle.node.gate import DeclaredPublisher, Kept
 from lifecycle.node.handlers import Key, alternatives, needs_handler
 from lifecycle.node.machine import NodeState
-from lifecycle.node.making import Maker
+from lifecycle.node.making import expand, make_entity, unmake
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -75,7 +75,6 @@ class DataLayer:
         self._gate = managed.gate
         self._turns = managed.turns
         self._changed = managed.configuration_changes.touch
-        self._maker = Maker(managed)
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
         self.endpoints: dict[Key, Endpoint] = {}
         self.connections = Connections(self._node, spec.participants)
@@ -373,7 +372,7 @@ class DataLayer:
         self._refuse_unconfigured(f"remap {spelling!r} of {self._name}")
         endpoint = self.find(spelling)
         before = endpoint.given_name
-        expanded = self._maker.expand(endpoint, name) if name else ""
+        expanded = expand(self._managed, endpoint, name) if name else ""
         if expanded == before:
             return
         endpoint.given_name = expanded
@@ -439,7 +438,7 @@ class DataLayer:
     def _place(self, endpoint: Endpoint, connection: Connection) -> Placement:
         """Make an endpoint on a connection; where it is now is left alone."""
         self._refuse_shared_flow(endpoint, connection)
-        entity = self._maker.make(endpoint, connection)
+        entity = make_entity(self._managed, endpoint, connection)
         unwatch: Callable[[], None] | None = None
         if endpoint.kind.is_topic:
             unwatch = watch_matches(
@@ -452,7 +451,7 @@ class DataLayer:
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
         if placement.unwatch is not None:
             placement.unwatch()
-        self._maker.unmake(endpoint.kind, placement.entity, placement.connection)
+        unmake(self._managed, endpoint.kind, placement.entity, placement.connection)
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""
