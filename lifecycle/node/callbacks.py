@@ -53,8 +53,6 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 SUCCESS = Result(outcome=CallbackOutcome.SUCCESS)
 
-_RCLPY_TYPE = "TransitionCallbackReturnType"
-
 
 class Running:
     """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
@@ -193,13 +191,8 @@ def judge(returned: object, *, what: str) -> Result:
 
     None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name.
     """
-    name = "SUCCESS" if returned is None else getattr(returned, "name", "")
-    known = (
-        returned is None
-        or isinstance(returned, CallbackOutcome)
-        or type(returned).__name__ == _RCLPY_TYPE
-    )
-    if not known or name not in CallbackOutcome.__members__:
+    name = "SUCCESS" if returned is None else str(getattr(returned, "name", ""))
+    if name not in CallbackOutcome.__members__:
         return Result(
             outcome=CallbackOutcome.ERROR,
             error=f"cannot use {returned!r}, returned by {what}; return SUCCESS, FAILURE, ERROR, "
