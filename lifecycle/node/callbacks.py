@@ -57,7 +57,7 @@ SUCCESS = Result(outcome=CallbackOutcome.SUCCESS)
 class Running:
     """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
 
-    An awaiting task is resumed each time that the executor wakes: who interrupts it has to wake it.
+    An awaiting task is resumed each time that the executor wakes: whoever interrupts it wakes it.
 
     Attributes:
         returned: what it returned.
@@ -187,7 +187,7 @@ def hint(error: Exception) -> str:
 
 
 def judge(returned: object, *, what: str) -> Result:
-    """Turn a callback's return value into a Result; what is none is an ERROR.
+    """Turn a callback's return value into a Result; another value than those known is an ERROR.
 
     None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name.
     """

@@ -489,7 +489,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def remap(self, endpoint: str, name: str) -> None:
         """Give a declared endpoint another topic or service name; "" gives back its own.
 
-        Raises LifecycleError for what is not a name: the endpoint is as it was.
+        Raises LifecycleError if it is not a name; the endpoint is as it was.
         """
         self.lifecycle.data_layer.remap(endpoint, name)
 
