@@ -53,13 +53,11 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 SUCCESS = Result(outcome=CallbackOutcome.SUCCESS)
 
-_RCLPY_TYPE = "TransitionCallbackReturnType"
-
 
 class Running:
     """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
 
-    An awaiting task is resumed each time that the executor wakes: who interrupts it has to wake it.
+    An awaiting task is resumed each time that the executor wakes: whoever interrupts it wakes it.
 
     Attributes:
         returned: what it returned.
@@ -148,10 +146,7 @@ async def called(callback: Callable[..., Any], *arguments: object) -> Any:
 async def result_of(running: Running, *, what: str, deadline_s: float) -> Result:
     """Run a transition callback and return its result; never raises for what the user did.
 
-    Args:
-        running: it; whoever awaits this interrupts it at its deadline, where it awaits.
-        what: for messages, "/camera: on_configure".
-        deadline_s: seconds, > 0.
+    Whoever awaits this interrupts it at its deadline, where it awaits.
     """
     began = time.monotonic()
     await running
@@ -192,17 +187,12 @@ def hint(error: Exception) -> str:
 
 
 def judge(returned: object, *, what: str) -> Result:
-    """Turn a callback's return value into a Result; what is none is an ERROR.
+    """Turn a callback's return value into a Result; another value than those known is an ERROR.
 
     None means SUCCESS. rclpy's TransitionCallbackReturn is known by its name.
     """
-    name = "SUCCESS" if returned is None else getattr(returned, "name", "")
-    known = (
-        returned is None
-        or isinstance(returned, CallbackOutcome)
-        or type(returned).__name__ == _RCLPY_TYPE
-    )
-    if not known or name not in CallbackOutcome.__members__:
+    name = "SUCCESS" if returned is None else str(getattr(returned, "name", ""))
+    if name not in CallbackOutcome.__members__:
         return Result(
             outcome=CallbackOutcome.ERROR,
             error=f"cannot use {returned!r}, returned by {what}; return SUCCESS, FAILURE, ERROR, "

@@ -107,10 +107,9 @@ class Connections:
         return tuple(each.read_dscp() for each in tuple(self._made.values()))
 
     def find(self, connection: Connection | str) -> Connection:
-        """Return the connection that is meant; the empty name is the node's own participant.
+        """Return the connection that is meant; raises UnknownConnectionError.
 
-        Raises:
-            UnknownConnectionError: there is none, or no longer.
+        The empty name is the node's own participant.
         """
         name = connection if isinstance(connection, str) else connection.name
         for each in (self.own, *self._made.values()):
@@ -135,13 +134,7 @@ class Connections:
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make the participant of a named connection; one that exists so already is returned.
 
-        Args:
-            name: letters, digits and underscores.
-            how: at least one URL; the plan says more of a connection that it knows by this name.
-
-        Raises:
-            ConnectError: not a name, a URL that is none, a name in use for other URLs, or the
-                participant could not be made.
+        The plan says more of a connection that it knows by this name. Raises ConnectError.
         """
         what = f"cannot connect {self._node.get_fully_qualified_name()} to {name!r}"
         if not _NAME.fullmatch(name):

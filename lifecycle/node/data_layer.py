@@ -34,7 +34,7 @@ from lifecycle.node.endpoint import (
 from lifecycle.node.gate import DeclaredPublisher, Kept
 from lifecycle.node.handlers import Key, alternatives, needs_handler
 from lifecycle.node.machine import NodeState
-from lifecycle.node.making import Maker
+from lifecycle.node.making import expand, make_entity, unmake
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -75,7 +75,6 @@ class DataLayer:
         self._gate = managed.gate
         self._turns = managed.turns
         self._changed = managed.configuration_changes.touch
-        self._maker = Maker(managed)
         self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
         self.endpoints: dict[Key, Endpoint] = {}
         self.connections = Connections(self._node, spec.participants)
@@ -87,11 +86,7 @@ class DataLayer:
         """Have one more endpoint, made at once where the others are.
 
         What a manifest says of the same name is kept. The same line may declare the same again:
-        on_activate runs more than once.
-
-        Raises:
-            LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
-                declared already, it needs a handler, or it cannot be made.
+        on_activate runs more than once. Raises LifecycleError.
         """
         is_early = self._managed.state is NodeState.UNCONFIGURED
         if not is_early:
@@ -197,11 +192,8 @@ class DataLayer:
     def prepare(self, handlers: Mapping[Key, Callable[..., Any]]) -> None:
         """Import every type and make the publishers' handles; no endpoint exists yet.
 
-        Args:
-            handlers: decorated methods, of what has no handler in code.
-
-        Raises:
-            LifecycleError: types that are not installed, all of them at once.
+        Handlers are those of what has none in code. Raises LifecycleError with every type that is
+        not installed.
         """
         problems: list[str] = []
         for endpoint in self._declared.values():
@@ -246,9 +238,8 @@ class DataLayer:
     def make(self) -> None:
         """Map every endpoint that is mapped nowhere onto what the plan says, or none.
 
-        Raises:
-            ConnectError: the first endpoint that could not be made, with the RMW's reason; under an
-                authority, which maps them all, those that are not mapped.
+        Raises ConnectError with the RMW's reason; or, under an authority that maps them, with all
+        that are not mapped.
         """
         for endpoint in self.endpoints.values():
             endpoint.error = ""
@@ -381,7 +372,7 @@ class DataLayer:
         self._refuse_unconfigured(f"remap {spelling!r} of {self._name}")
         endpoint = self.find(spelling)
         before = endpoint.given_name
-        expanded = self._maker.expand(endpoint, name) if name else ""
+        expanded = expand(self._managed, endpoint, name) if name else ""
         if expanded == before:
             return
         endpoint.given_name = expanded
@@ -416,11 +407,7 @@ class DataLayer:
         self._unplace(endpoint, placement)
 
     def _move(self, endpoint: Endpoint, connection: Connection, *, at_once: bool = False) -> Future:
-        """Make an endpoint on a connection, before it breaks where it was; raises LifecycleError.
-
-        Returns:
-            Done once it is nowhere else.
-        """
+        """Make an endpoint on a connection, before it breaks where it was; done once it has."""
         if endpoint.handover is not None:
             endpoint.handover.end()
         old, peers = endpoint.placement, _peers(endpoint)
@@ -451,7 +438,7 @@ class DataLayer:
     def _place(self, endpoint: Endpoint, connection: Connection) -> Placement:
         """Make an endpoint on a connection; where it is now is left alone."""
         self._refuse_shared_flow(endpoint, connection)
-        entity = self._maker.make(endpoint, connection)
+        entity = make_entity(self._managed, endpoint, connection)
         unwatch: Callable[[], None] | None = None
         if endpoint.kind.is_topic:
             unwatch = watch_matches(
@@ -464,7 +451,7 @@ class DataLayer:
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
         if placement.unwatch is not None:
             placement.unwatch()
-        self._maker.unmake(endpoint.kind, placement.entity, placement.connection)
+        unmake(self._managed, endpoint.kind, placement.entity, placement.connection)
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""

@@ -93,14 +93,8 @@ def watch_matches(
 ) -> Callable[[], None]:
     """Call `changed` each time that peers of an endpoint were matched or unmatched.
 
-    Args:
-        node: whose executor calls; the endpoint may be on another participant.
-        entity: the endpoint.
-        group: reentrant.
-        changed: is called.
-
-    Returns:
-        What ends it, before the endpoint is destroyed.
+    The executor of `node` calls; the endpoint may be on another participant. Returns what ends
+    it, before the endpoint is destroyed.
     """
     event = QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
     if isinstance(entity, Publisher):
@@ -251,12 +245,8 @@ class Handover:
     prove that the other side has seen it: the old one stays a little longer than that. Meanwhile a
     publisher publishes by the old one, and a subscription receives by both.
 
-    Args:
-        old: where it is until then.
-        peers_before: how many peers it had there.
-        finish: destroys the old one; called exactly once.
-
     Attributes:
+        old: where it is until then.
         done: the old one is destroyed.
     """
 

@@ -137,9 +137,6 @@ def on_timer(*, period_s: float) -> Callable[[F], F]:
         ...     @on_timer(period_s=0.1)
         ...     def tick(self):
         ...         self.publisher("chatter").publish(String(data="hello"))
-
-    Raises:
-        LifecycleError: `period_s` is not positive.
     """
     if not period_s > 0:
         raise LifecycleError(f"cannot call a method every {period_s!r} s; period_s must be > 0")
@@ -179,8 +176,7 @@ def match(
         What handles each endpoint; and what is called each so many seconds.
 
     Raises:
-        LifecycleError: with every endpoint without a handler, every handler without an endpoint
-            and every endpoint with two, each with the nearest spelling.
+        LifecycleError: with every mistake, and the nearest spelling.
     """
     class_ = type(node).__name__
     wanted = [(each.kind, each.name) for each in endpoints if needs_handler(each.kind)]

@@ -40,136 +40,130 @@ _DESTROY = {
 }
 
 
-class Maker:
-    """Makes and destroys the entities of one node, whose executor runs their callbacks."""
-
-    def __init__(self, managed: Managed) -> None:
-        self._managed = managed
-        self._node = managed.node
-        self._gate = managed.gate
-        self._turns = managed.turns
-
-    def make(self, endpoint: Endpoint, connection: Connection) -> Any:
-        """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
-        kind, introspection = endpoint.kind, endpoint.options.get("introspection")
-        make = self._topic_end if kind.is_topic else self._served
-        entity = make(endpoint, connection, self._name(endpoint, connection))
-        if introspection is not None:
-            entity.configure_introspection(
-                self._node.get_clock(), qos_profile_system_default, introspection
-            )
-        made = wire_name(entity)
-        if endpoint.given_name and made and made != endpoint.given_name:
-            self.unmake(kind, entity, connection)
-            raise LifecycleError(
-                f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
-                f"rule that the node was started with makes it {made!r}",
-                hint="take the rule out of the manifest's `remap:`, or choose another name",
-            )
-        return entity
-
-    def unmake(self, kind: EndpointKind, entity: Any, connection: Connection) -> None:
-        """Destroy an entity that `make` returned for an endpoint on a connection."""
-        self._gate.remove(entity)
-        if connection.participant is not None:
-            connection.participant.destroy_endpoint(entity)
-        elif kind.is_action:
-            entity.destroy()
-        else:
-            getattr(self._node, _DESTROY[kind])(entity)
-
-    def expand(self, endpoint: Endpoint, name: str) -> str:
-        """Return a new name for an endpoint fully qualified; no remapping rule applies."""
-        resolve = self._node.resolve_service_name
-        if endpoint.kind.is_topic:
-            resolve = self._node.resolve_topic_name
-        try:
-            return str(resolve(name, only_expand=True))
-        except Exception as error:
-            reason = str(error).splitlines()[0].partition(", at /")[0]  # rcl's source file
-            raise LifecycleError(
-                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
-            ) from error
-
-    def _topic_end(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        qos, options = endpoint.planned.qos or QosProfile(), endpoint.options
-        create = factory(endpoint.planned, connection, self._node)
-        if endpoint.kind is EndpointKind.PUBLISHER:
-            return create(endpoint.interface, name, qos, **options)
-        entity = create(endpoint.interface, name, endpoint.handler, qos, **options)
-        self._gate.add(entity, GatedSubscription(entity, self._gate, self._turns.call_soon))
-        return entity
-
-    def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        """Make an end of a service or an action."""
-        make = functools.partial(self._served_on, endpoint, name=name)
-        # rcl applies rules to an action's hidden names itself; torn apart, it is not made.
-        resolved = name
-        if connection.participant is not None:
-            entity = connection.participant.create(make, endpoint.kind.noun, name)
-        else:
-            if endpoint.kind.is_action:
-                resolved = resolve_action_name(self._node, name)
-            entity = make(self._node)
-        if endpoint.kind.is_action:
-            entity.action_name = resolved
-        return entity
-
-    def _served_on(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
-        kind, interface = endpoint.kind, endpoint.interface
-        # Answers of clients arrive while callbacks run.
-        own = self._turns.group if kind in CLIENTS else self._node.default_callback_group
-        group = endpoint.options.get("callback_group") or own
-        if kind.is_action:
-            # Late: numpy, 100 ms.
-            from lifecycle.middleware.services.actions import GoalClient, GoalServer
-
-            if kind is EndpointKind.ACTION_CLIENT:
-                return GoalClient(
-                    node, interface, name, group=group, refuse_to_block=refuse_to_block
-                )
-            goals = Goals(self._managed, endpoint)
-            goals.server = GoalServer(
-                node, interface, name, goals.execute, accept=goals.accept, group=group
-            )
-            self._gate.add_worker(goals.server, goals.end)
-            return goals.server
-        options: dict[str, Any] = {"callback_group": group}
-        if endpoint.planned.qos is not None:
-            options["qos_profile"] = to_rclpy(endpoint.planned.qos)
-        if kind is EndpointKind.SERVICE_CLIENT:
-            client = Node.create_client(node, interface, name, **options)
-            refuse_to_deadlock(client)
-            return client
-        assert endpoint.handler is not None
-        service = Node.create_service(
-            node, interface, name, _answering(endpoint.handler), **options
+def make_entity(managed: Managed, endpoint: Endpoint, connection: Connection) -> Any:
+    """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
+    kind, introspection = endpoint.kind, endpoint.options.get("introspection")
+    create = _topic_end if kind.is_topic else _served
+    entity = create(managed, endpoint, connection, _name(managed, endpoint, connection))
+    if introspection is not None:
+        entity.configure_introspection(
+            managed.node.get_clock(), qos_profile_system_default, introspection
         )
-        self._survive_late_answers(service, endpoint.name)
-        return service
+    made = wire_name(entity)
+    if endpoint.given_name and made and made != endpoint.given_name:
+        unmake(managed, kind, entity, connection)
+        raise LifecycleError(
+            f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
+            f"rule that the node was started with makes it {made!r}",
+            hint="take the rule out of the manifest's `remap:`, or choose another name",
+        )
+    return entity
 
-    def _name(self, endpoint: Endpoint, connection: Connection) -> str:
-        """Return what an endpoint is called where it is made: hidden nodes resolve nothing."""
-        if endpoint.given_name or connection.participant is None:
-            return endpoint.given_name or endpoint.name
-        return resolve_name(self._node, endpoint.kind, endpoint.name)
 
-    def _survive_late_answers(self, service: Any, name: str) -> None:
-        """Let an answer after its server was destroyed be lost, not end the process."""
-        send = service.send_response
-        warn = self._managed.log.warning
+def unmake(managed: Managed, kind: EndpointKind, entity: Any, connection: Connection) -> None:
+    """Destroy an entity that `make_entity` returned for an endpoint on a connection."""
+    managed.gate.remove(entity)
+    if connection.participant is not None:
+        connection.participant.destroy_endpoint(entity)
+    elif kind.is_action:
+        entity.destroy()
+    else:
+        getattr(managed.node, _DESTROY[kind])(entity)
 
-        @functools.wraps(send)
-        def send_response(response: Any, header: Any) -> None:
-            try:
-                send(response, header)
-            except InvalidHandle:
-                warn(
-                    f"cannot send the answer of service server {name!r}: it was "
-                    "disconnected while its handler worked on it"
-                )
 
-        service.send_response = send_response
+def expand(managed: Managed, endpoint: Endpoint, name: str) -> str:
+    """Return a new name for an endpoint fully qualified; no remapping rule applies."""
+    resolve = managed.node.resolve_service_name
+    if endpoint.kind.is_topic:
+        resolve = managed.node.resolve_topic_name
+    try:
+        return str(resolve(name, only_expand=True))
+    except Exception as error:
+        reason = str(error).splitlines()[0].partition(", at /")[0]  # rcl's source file
+        raise LifecycleError(
+            f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
+        ) from error
+
+
+def _topic_end(managed: Managed, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+    qos, options = endpoint.planned.qos or QosProfile(), endpoint.options
+    create = factory(endpoint.planned, connection, managed.node)
+    if endpoint.kind is EndpointKind.PUBLISHER:
+        return create(endpoint.interface, name, qos, **options)
+    entity = create(endpoint.interface, name, endpoint.handler, qos, **options)
+    managed.gate.add(entity, GatedSubscription(entity, managed.gate, managed.turns.call_soon))
+    return entity
+
+
+def _served(managed: Managed, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+    """Make an end of a service or an action."""
+    create = functools.partial(_served_on, managed, endpoint, name=name)
+    # rcl applies rules to an action's hidden names itself; torn apart, it is not made.
+    resolved = name
+    if connection.participant is not None:
+        entity = connection.participant.create(create, endpoint.kind.noun, name)
+    else:
+        if endpoint.kind.is_action:
+            resolved = resolve_action_name(managed.node, name)
+        entity = create(managed.node)
+    if endpoint.kind.is_action:
+        entity.action_name = resolved
+    return entity
+
+
+def _served_on(managed: Managed, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+    kind, interface = endpoint.kind, endpoint.interface
+    # Answers of clients arrive while callbacks run.
+    own = managed.turns.group if kind in CLIENTS else managed.node.default_callback_group
+    group = endpoint.options.get("callback_group") or own
+    if kind.is_action:
+        # Late: numpy, 100 ms.
+        from lifecycle.middleware.services.actions import GoalClient, GoalServer
+
+        if kind is EndpointKind.ACTION_CLIENT:
+            return GoalClient(node, interface, name, group=group, refuse_to_block=refuse_to_block)
+        goals = Goals(managed, endpoint)
+        goals.server = GoalServer(
+            node, interface, name, goals.execute, accept=goals.accept, group=group
+        )
+        managed.gate.add_worker(goals.server, goals.end)
+        return goals.server
+    options: dict[str, Any] = {"callback_group": group}
+    if endpoint.planned.qos is not None:
+        options["qos_profile"] = to_rclpy(endpoint.planned.qos)
+    if kind is EndpointKind.SERVICE_CLIENT:
+        client = Node.create_client(node, interface, name, **options)
+        refuse_to_deadlock(client)
+        return client
+    assert endpoint.handler is not None
+    service = Node.create_service(node, interface, name, _answering(endpoint.handler), **options)
+    _survive_late_answers(managed, service, endpoint.name)
+    return service
+
+
+def _name(managed: Managed, endpoint: Endpoint, connection: Connection) -> str:
+    """Return what an endpoint is called where it is made: hidden nodes resolve nothing."""
+    if endpoint.given_name or connection.participant is None:
+        return endpoint.given_name or endpoint.name
+    return resolve_name(managed.node, endpoint.kind, endpoint.name)
+
+
+def _survive_late_answers(managed: Managed, service: Any, name: str) -> None:
+    """Let an answer after its server was destroyed be lost, not end the process."""
+    send = service.send_response
+    warn = managed.log.warning
+
+    @functools.wraps(send)
+    def send_response(response: Any, header: Any) -> None:
+        try:
+            send(response, header)
+        except InvalidHandle:
+            warn(
+                f"cannot send the answer of service server {name!r}: it was "
+                "disconnected while its handler worked on it"
+            )
+
+    service.send_response = send_response
 
 
 def factory(planned: PlannedEndpoint, connection: Connection, node: Node) -> Callable[..., Any]:

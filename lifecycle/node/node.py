@@ -109,6 +109,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     process before that. An exception in a message, service or timer callback ends the process,
     as with any rclpy node; one in an action's handler ends its goal.
 
+    A name that is not declared, or by several kinds, raises UnknownEndpointError, a KeyError too;
+    the node interface (`connect_to` and its like) raises NotConfiguredError before configure.
+
     Args:
         node_name: base name; by default the class's name in snake_case. A manifest's name wins.
         lifecycle: "manual" waits for others to drive it; "auto" configures, connects and activates
@@ -173,11 +176,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         return self.lifecycle.state is NodeState.ACTIVE
 
     def publisher(self, name: str) -> DeclaredPublisher:
-        """Return the declared publisher `name`, from on_configure on.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-        """
+        """Return the declared publisher `name`, from on_configure on."""
         handle = self.lifecycle.data_layer.declared(EndpointKind.PUBLISHER, name).handle
         assert handle is not None
         return handle
@@ -186,11 +185,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """Return the declared service client `name`, from on_connect on.
 
         In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` raises
-        DeadlockError.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-            LifecycleError: the node is not connected.
+        DeadlockError. Raises LifecycleError while the node is not connected.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
 
@@ -370,9 +365,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             endpoint: `video`, or `publishers/video` where another kind has the name too.
             lossy: the data bear an unreliable transport.
             size_bytes: the largest serialized message, > 0.
-
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
         """
         data_layer = self.lifecycle.data_layer
         data_layer.hint(data_layer.find(endpoint), lossy, size_bytes)
@@ -399,7 +391,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             introspection: of a service server or client: what it publishes of each call.
 
         Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
             LifecycleError: its kind cannot have one of them, or it exists already.
         """
         given = {
@@ -448,7 +439,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
 
         Raises:
             ConnectError: not a URL, not a name, in use for other URLs, or the middleware refused.
-            NotConfiguredError: not in this state.
 
         Example:
             >>> net = self.connect_to("udpv4://10.77.0.1:7911", name="net")
@@ -472,10 +462,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             Done once the endpoint is on the new connection alone; await it or ignore it.
 
         Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
             UnknownConnectionError: no such connection.
             ConnectError: it cannot be made there; where it was it still is.
-            NotConfiguredError: not in this state.
         """
         return self.lifecycle.data_layer.map_to(endpoint, connection)
 
@@ -485,16 +473,13 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Raises:
             UnknownConnectionError: no such connection.
             ConnectError: it is the node's own participant.
-            NotConfiguredError: not in this state.
         """
         self.lifecycle.data_layer.disconnect(connection)
 
     def remap(self, endpoint: str, name: str) -> None:
         """Give a declared endpoint another topic or service name; "" gives back its own.
 
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
-            LifecycleError: not a name; the endpoint is as it was.
+        Raises LifecycleError if it is not a name; the endpoint is as it was.
         """
         self.lifecycle.data_layer.remap(endpoint, name)
 

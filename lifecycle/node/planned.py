@@ -225,9 +225,8 @@ def _give_empty_arrays(node: Node, spec: PlannedNode) -> None:
 def _array_type(declared: tuple[Any, ...], wanted: str | None) -> Parameter.Type | None:
     """Return the type of an empty array that a declaration is to get; None if it is to get none.
 
-    Args:
-        declared: name, value or type, and descriptor, as rclpy's declare_parameters() has them.
-        wanted: our name of the type; empty: that of the declaration; None: no array is given.
+    It is declared as rclpy's declare_parameters() has it; `wanted` is our name of the type, empty
+    for that of the declaration.
     """
     if wanted is None:
         return None

@@ -95,6 +95,7 @@ class Adoption:
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
+        participants: of the process.
         made: what stands for each node, by its key in the plan.
         unfollow: ends that nodes of this process are taken for those of the plan.
     """

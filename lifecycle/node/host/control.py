@@ -19,7 +19,6 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn
 
 import msgspec
 
@@ -251,15 +250,6 @@ def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
         sys.stderr.flush()
     reason = str(error) if isinstance(error, LifecycleError) else f"{type(error).__name__}: {error}"
     channel.write(Event(kind="failed", node=node, ok=False, error=reason))
-
-
-def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
-    """Report a failure, and end the process."""
-    report_failure(channel, node, error)
-    channel.drain()
-    from lifecycle.middleware.process.control import leave_and_exit
-
-    leave_and_exit(1)
 
 
 def _of_user(trace: TracebackType | None) -> TracebackType | None:

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.node.host.control import Command, HostChannel, HostSpec, give_up
+from lifecycle.node.host.control import Command, HostChannel, HostSpec, report_failure
 
 _PRELOADED = (
     "rclpy.executors",
@@ -88,7 +88,11 @@ def serve(control: socket.socket) -> NoReturn:
 
         context = process_context(spec)
     except Exception as error:  # noqa: BLE001 - reported to the supervisor
-        give_up(channel, "", error)
+        from lifecycle.middleware.process.control import leave_and_exit
+
+        report_failure(channel, "", error)
+        channel.drain()
+        leave_and_exit(1)
     Host(spec, context, channel).run()
 
 
