@@ -24,7 +24,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
-    from lifecycle.export.picture.model import Picture
+    from lifecycle.export.picture import Picture
     from lifecycle.plan.model import Plan
 
 
@@ -109,6 +109,6 @@ def render(picture: Picture, format_: str) -> str:
         from lifecycle.codec import to_json
 
         return json_text(to_json(picture).decode())
-    from lifecycle.export.picture import WRITERS
+    from lifecycle.export.picture_writers import WRITERS
 
     return WRITERS[format_](picture)

@@ -64,8 +64,8 @@ def render(plan: Plan, format_: str) -> str:
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
         return to_json(without_secrets(plan)).decode()
-    from lifecycle.export.picture import WRITERS
-    from lifecycle.export.picture.build import build_picture
+    from lifecycle.export.picture import build_picture
+    from lifecycle.export.picture_writers import WRITERS
 
     return WRITERS[format_](build_picture(plan))
 
