@@ -77,8 +77,8 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
 def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
     """Return IPFilterRule text (RFC 6733 §4.3.1) in the shape of 3GPP TS 29.214 §5.3.8."""
     device, server = f"{end.device} {end.device_port}", f"{end.server} {end.server_port}"
-    by_name = settings.protocol_by_name
-    protocol = rule.transport_protocol.value if by_name else rule.protocol_number
+    name = rule.transport_protocol.value
+    protocol = name if settings.protocol_by_name else _PROTOCOLS[name]
     if end.sends:
         return f"permit in {protocol} from {device} to {server}"
     return f"permit out {protocol} from {server} to {device}"

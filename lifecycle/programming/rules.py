@@ -120,11 +120,6 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         """The family, which the destination decides."""
         return InternetProtocol.IPV6 if ":" in self.destination_address else InternetProtocol.IPV4
 
-    @property
-    def protocol_number(self) -> int:
-        """IANA protocol number, 6 or 17."""
-        return PROTOCOL_NUMBERS[self.transport_protocol.value]
-
     def left_out(self, reason: str) -> list[str]:
         """Return each pair that this one flow carries as one that is left out."""
         return [f"{_pair(*names)}: {reason}" for names in self.names]

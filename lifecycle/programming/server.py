@@ -281,18 +281,17 @@ class ServerTarget(Target):
         """Make it so, one flow after the other.
 
         Raises:
-            PartlyError: for some flows it failed; the others are done.
+            PartlyError: for some flows it failed; what was to be deleted stays in the ledger.
         """
         wanted, left_out = self._wanted(rules)
-        return replace(self._carried_out(wanted), left_out=left_out)
-
-    def remove(self) -> TargetChanges:
-        """Delete everything of ours at the server.
-
-        Raises:
-            PartlyError: some could not be deleted; they stay in the ledger.
-        """
-        return self._carried_out(())
+        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
+        done, failed = each_done(planned, self._make)
+        made = TargetChanges(target=self.name, changes=tuple(done))
+        if failed:
+            errors = [(change.key, error) for (change, _), error in failed]
+            text = [made.render(done=True)] if made.pending else []
+            raise PartlyError(self.name, len(planned), errors, done=text)
+        return replace(made, left_out=left_out)
 
     def _changes(self, wanted: Sequence[Wanted]) -> Iterator[tuple[FlowChange, Body]]:
         """Yield what is to be done, with the body that is wanted."""
@@ -322,16 +321,6 @@ class ServerTarget(Target):
         if seen.differs:
             return ChangeKind.UPDATE, seen.differs
         return ChangeKind.KEEP, seen.detail
-
-    def _carried_out(self, wanted: Sequence[Wanted]) -> TargetChanges:
-        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
-        done, failed = each_done(planned, self._make)
-        made = TargetChanges(target=self.name, changes=tuple(done))
-        if failed:
-            errors = [(change.key, error) for (change, _), error in failed]
-            text = [made.render(done=True)] if made.pending else []
-            raise PartlyError(self.name, len(planned), errors, done=text)
-        return made
 
     def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
         """Make one change; return it with what came of it."""

@@ -1,7 +1,7 @@
 """What a network target is, which there are, what it changes, and what can go wrong.
 
-Owns: `Target`, which plans, applies and removes; the names of all of them; their answers as text;
-the errors of this package. A target is imported on first use, see `names`.
+Owns: `Target`, which plans, applies and removes; their answers as text; how long servers are waited
+for; the errors of this package. A target is imported on first use.
 """
 
 from __future__ import annotations
@@ -276,9 +276,9 @@ class Target(abc.ABC):
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, and return what was done; a second time changes nothing."""
 
-    @abc.abstractmethod
     def remove(self) -> TargetChanges:
         """Delete everything of ours."""
+        return self.apply(())
 
     def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""

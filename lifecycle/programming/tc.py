@@ -283,14 +283,6 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
         )
 
 
-def render_tc_removal(device: str) -> str:
-    """Return the line for `tc -batch` that removes our qdisc and all below it.
-
-    It fails, and removes nothing, if the device's root qdisc is not ours.
-    """
-    return f"qdisc del dev {device} root handle {OWNED_HANDLE}\n"
-
-
 class TcTarget(TableTarget):
     """One device.
 
@@ -401,7 +393,7 @@ class TcTarget(TableTarget):
         """Delete our qdisc and our table, where they are."""
         ours = self._is_ours()
         if ours:
-            self._batch(render_tc_removal(self._device))
+            self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
         return super().clear() or ours
 
     def _root(self) -> Qdisc | None:
