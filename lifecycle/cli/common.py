@@ -23,7 +23,6 @@ from lifecycle.printable import lines
 from lifecycle.programming import TARGETS
 
 if TYPE_CHECKING:
-    from lifecycle.manifest.loading import Loaded
     from lifecycle.manifest.model import Manifest
     from lifecycle.plan.model import Plan
     from lifecycle.plan.programs import Resolution
@@ -141,15 +140,16 @@ def run_commands_option(function: F) -> F:
     )(function)
 
 
-def load_manifest(
+def load_plan(
     path: str,
     assignments: tuple[str, ...],
     *,
     quiet: bool = False,
     machine: str | None = None,
     run_commands: bool = True,
-) -> Loaded:
-    """Load and check a manifest; print warnings to stderr unless `quiet`.
+    domain_id: int | None = None,
+) -> Plan:
+    """Load and check a manifest, and plan it; print warnings to stderr unless `quiet`.
 
     Args:
         path: the file.
@@ -158,12 +158,14 @@ def load_manifest(
         machine: what its nodes run is looked for, too, as `up --machine` would start it; None looks
             for nothing.
         run_commands: see `load`.
+        domain_id: in the place of the manifest's.
 
     Raises:
         ManifestError: with every diagnostic.
     """
     from lifecycle.manifest.diagnostics import ManifestError, Severity
     from lifecycle.manifest.loading import load
+    from lifecycle.plan.build import build_plan
 
     loaded = load(path, parse_assignments(assignments), run_commands=run_commands)
     warnings = loaded.warnings
@@ -175,24 +177,7 @@ def load_manifest(
     if not quiet:
         for warning in warnings:
             click.echo(lines(str(warning)), err=True)
-    return loaded
-
-
-def load_plan(
-    path: str,
-    assignments: tuple[str, ...],
-    *,
-    quiet: bool = False,
-    machine: str | None = None,
-    run_commands: bool = True,
-) -> Plan:
-    """Load a manifest as `load_manifest` does, and return its plan."""
-    from lifecycle.plan.build import build_plan
-
-    loaded = load_manifest(
-        path, assignments, quiet=quiet, machine=machine, run_commands=run_commands
-    )
-    return build_plan(loaded.manifest)
+    return build_plan(loaded.manifest, domain_id=domain_id)
 
 
 def resolve(manifest: Manifest, machine: str = "") -> Resolution:

@@ -32,7 +32,6 @@ from lifecycle.cli.report import (
     report_format,
     report_option,
     write_report,
-    written_or_said,
 )
 from lifecycle.codec import Count, to_json
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
@@ -258,8 +257,7 @@ def _argument(each: ArgumentDeclaration) -> str:
 
 
 def _write(report: Path, found: CheckReport, *, strict: bool) -> ExitCode:
-    text = write_check(found, report_format(report), strict=strict)
-    return written_or_said(lambda: write_report(report, text))
+    return write_report(report, write_check(found, report_format(report), strict=strict))
 
 
 def _refused(path: str, error: LifecycleError) -> CheckReport:
@@ -350,7 +348,7 @@ def verify_command(  # noqa: PLR0917 - click passes options by name
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             seen = with_supervisors_numbers(seen)
             with ending.noted():
-                unwritten = written_or_said(lambda: written.end(seen.verdict))
+                unwritten = written.end(seen.verdict)
     except Ended as ended:
         click.echo(f"ended before it was judged: {ended.reason}", err=True)
         return ended.exit_code
