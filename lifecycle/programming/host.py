@@ -25,7 +25,7 @@ from lifecycle.codec import from_json
 from lifecycle.errors import UsageError
 from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed, named
+from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -33,7 +33,6 @@ from lifecycle.programming.target import (
     ProgrammingError,
     Target,
     TargetChanges,
-    describe_rule,
 )
 from lifecycle.run_directory import OWN_CHILD
 
@@ -345,7 +344,7 @@ class TableTarget(Target):
     def export(self, rules: RuleSet) -> str:
         """Return a file that programs a host, and says in comments what is left out of it."""
         placed, left_out = expressed(rules.rules, self.lines)
-        remarks = [f"# {named(each)}: {each.describe()}: {asks(each)}" for each in rules.rules]
+        remarks = [f"# {each.named}: {each.describe()}: {each.asks}" for each in rules.rules]
         remarks += [f"# left out: {each}" for each in (*rules.left_out, *left_out)]
         return self.script(self.wanted(placed), remarks)
 
@@ -382,7 +381,7 @@ class TableTarget(Target):
         except ValueError as error:
             raise ProgrammingError(str(error)) from error
         entries = tuple(
-            Entry(key=rule.key, what=describe_rule(rule), body="\n".join(lines))
+            Entry(key=rule.key, what=f"{rule.describe()}, {rule.asks}", body="\n".join(lines))
             for rule, lines in placed
         )
         if write and not entries:

@@ -25,7 +25,7 @@ from lifecycle.programming.host import (
     table_name,
 )
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
 
 _BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
@@ -65,7 +65,7 @@ class NftTarget(TableTarget):
             found.append((f"{network} flowlabel set {label}", f"flow label {label}"))
         if not found:
             raise ValueError("it has no DSCP and no flow label to set")
-        match, flows = flow_match(rule), named(rule)
+        match, flows = flow_match(rule), rule.named
         return [chain_line(match, statement, f"{mark}: {flows}") for statement, mark in found]
 
     def wanted(self, placed: Placed) -> Wanted:

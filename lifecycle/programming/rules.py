@@ -130,6 +130,23 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         destination = socket_text(self.destination_address, self.destination_port)
         return f"{self.transport_protocol.value} {source} → {destination}"
 
+    @property
+    def named(self) -> str:
+        """Its flows: `/robot/video /robot/camera → /viewer`, several with commas."""
+        return ", ".join(_pair(*names) for names in self.names)
+
+    @property
+    def asks(self) -> str:
+        """What it asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
+        found = [] if self.dscp is None else [describe(self.dscp)]
+        if self.five_qi is not None:
+            found.append(f"5QI {self.five_qi}")
+        if self.flow_label:
+            found.append(f"flow label {self.flow_label:#07x}")
+        if self.max_delay_ms is not None:
+            found.append(f"at most {self.max_delay_ms:g} ms")
+        return ", ".join(found) or "nothing"
+
 
 def _address(text: str) -> IpAddress:
     """Return the address that `text` spells.
@@ -343,7 +360,7 @@ def _disagreement(sharing: Sequence[FlowRule]) -> Iterator[str]:
         asked = (each.dscp, each.five_qi)
         other = next(other for other in sharing if (other.dscp, other.five_qi) != asked)
         yield from each.left_out(
-            f"shares its 5-tuple with {named(other)}, which is to be treated differently; "
+            f"shares its 5-tuple with {other.named}, which is to be treated differently; "
             "make one of them unique"
         )
 
@@ -379,23 +396,6 @@ def _same_host(plan: Plan, report: FlowReport) -> bool:
     ends = [_node(plan, name) for name in (report.publisher, report.subscription)]
     places = {"" if end is None else addresses.get(end.machine, "") for end in ends}
     return len(places) == 1
-
-
-def named(rule: FlowRule) -> str:
-    """Return the flows of a rule: `/robot/video /robot/camera → /viewer`, several with commas."""
-    return ", ".join(_pair(*names) for names in rule.names)
-
-
-def asks(rule: FlowRule) -> str:
-    """Return what a rule asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
-    found = [] if rule.dscp is None else [describe(rule.dscp)]
-    if rule.five_qi is not None:
-        found.append(f"5QI {rule.five_qi}")
-    if rule.flow_label:
-        found.append(f"flow label {rule.flow_label:#07x}")
-    if rule.max_delay_ms is not None:
-        found.append(f"at most {rule.max_delay_ms:g} ms")
-    return ", ".join(found) or "nothing"
 
 
 def expressed(

@@ -31,7 +31,7 @@ from lifecycle.programming.http import (
     text_of,
 )
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
+from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -41,7 +41,6 @@ from lifecycle.programming.target import (
     SettingsError,
     Target,
     TargetChanges,
-    describe_rule,
     each_done,
 )
 
@@ -108,7 +107,7 @@ def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str
         ValueError: there is no name.
     """
     if rule.five_qi is None:
-        raise ValueError(f"it asks for no 5QI ({asks(rule)})")
+        raise ValueError(f"it asks for no 5QI ({rule.asks})")
     if rule.five_qi not in names:
         raise ValueError(
             f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
@@ -213,7 +212,7 @@ class ServerTarget(Target):
             {
                 "key": each.key,
                 "flow": each.rule.describe(),
-                "asks": asks(each.rule),
+                "asks": each.rule.asks,
                 "body": each.body,
             }
             for each in wanted
@@ -303,7 +302,7 @@ class ServerTarget(Target):
                 yield FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what), {}
         for each in wanted:
             kind, detail = self._compare(entries.get(each.key), each.body)
-            what = describe_rule(each.rule)
+            what = f"{each.rule.describe()}, {each.rule.asks}"
             yield FlowChange(kind=kind, key=each.key, what=what, detail=detail), each.body
 
     def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:

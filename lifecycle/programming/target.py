@@ -21,7 +21,7 @@ import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming import TARGETS
-from lifecycle.programming.rules import FlowRule, RuleSet, asks
+from lifecycle.programming.rules import FlowRule, RuleSet
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
@@ -351,11 +351,6 @@ def each_done(
         except LifecycleError as error:  # noqa: PERF203 - the others go on
             failed.append((each, error))
     return done, failed
-
-
-def describe_rule(rule: FlowRule) -> str:
-    """Return a rule for people: the tuple and what it gets."""
-    return f"{rule.describe()}, {asks(rule)}"
 
 
 class ProgrammingError(LifecycleError):

@@ -42,7 +42,7 @@ from lifecycle.programming.host import (
     table_name,
 )
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError
 
 OWNED_HANDLE = "1f10:"
@@ -340,7 +340,7 @@ class TcTarget(TableTarget):
             raise ValueError(
                 "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
             )
-        matches, comment = [flow_match(rule)], f"{class_.comment}: {named(rule)}"
+        matches, comment = [flow_match(rule)], f"{class_.comment}: {rule.named}"
         if self._settings.match is TcMatch.MARK:
             if rule.dscp is None:
                 raise ValueError("it has no DSCP, and rules look at nothing else here")
