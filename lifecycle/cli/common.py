@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
+from lifecycle.codec import to_json
 from lifecycle.errors import UsageError, did_you_mean
-from lifecycle.printable import lines
+from lifecycle.printable import json_text, lines
 from lifecycle.programming import TARGETS
 
 if TYPE_CHECKING:
@@ -197,6 +198,11 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
 
 
+def json_of(value: object) -> str:
+    """Return a value as JSON that a terminal can show."""
+    return json_text(to_json(value).decode())
+
+
 def output_option(what: str) -> Callable[[F], F]:
     """Add `--output FILE` to a verb that prints `what`."""
     return click.option(
@@ -217,8 +223,13 @@ def write_text(path: Path, text: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_text(path, text)
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"cannot write {str(path)!r}: {why}") from error
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError | ValueError, what: str = "") -> UsageError:
+    """Return the error for a file that cannot be written; `what` says which it is."""
+    why = error.strerror if isinstance(error, OSError) else error
+    return UsageError(f"cannot write {what}{str(path)!r}: {why}")
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import replace
 
-from lifecycle.cli.common import replace_text
+from lifecycle.cli.common import replace_text, unwritable
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import count, lines
 
@@ -65,7 +65,7 @@ def open_report(path: Path) -> None:
         elif not os.access(path, os.W_OK):
             raise PermissionError(13, "Permission denied")
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise unwritable(path, error, "report ") from error
 
 
 def write_report(path: Path, text: str) -> ExitCode:
@@ -86,7 +86,7 @@ def _replace(path: Path, text: str) -> None:
     try:
         replace_text(path, text.rstrip("\n") + "\n")
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise unwritable(path, error, "report ") from error
 
 
 def report_option(function: F) -> F:
@@ -257,7 +257,3 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
 def _is_stream(path: Path) -> bool:
     """Whether it is a pipe or a terminal, which is written once, in the end."""
     return path.exists() and not (path.is_file() or path.is_dir())
-
-
-def _unwritable(path: Path, error: OSError) -> UsageError:
-    return UsageError(f"cannot write report {str(path)!r}: {error.strerror}")

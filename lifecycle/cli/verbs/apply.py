@@ -16,13 +16,14 @@ from lifecycle.cli.common import (
     assignments_argument,
     completing,
     format_option,
+    json_of,
     load_plan,
     machine_option,
     timeout_option,
 )
-from lifecycle.codec import Count, says, to_json
+from lifecycle.codec import Count, says
 from lifecycle.errors import BringUpError, ExitCode, UsageError
-from lifecycle.printable import json_text, lines
+from lifecycle.printable import lines
 from lifecycle.supervisor.control.protocol import ChangedNodes
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def command(
     if as_text:
         _say(report)
     else:
-        click.echo(json_text(to_json(report).decode()))
+        click.echo(json_of(report))
     return report.exit_code
 
 

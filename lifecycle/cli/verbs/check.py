@@ -17,6 +17,7 @@ import msgspec
 from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
 from lifecycle.cli.common import (
     format_option,
+    json_of,
     load_plan,
     machine_option,
     manifest_arguments,
@@ -33,14 +34,14 @@ from lifecycle.cli.report import (
     report_option,
     write_report,
 )
-from lifecycle.codec import Count, to_json
+from lifecycle.codec import Count
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.loading import ArgumentDeclaration, declared_arguments, load
 from lifecycle.manifest.model import Manifest
 from lifecycle.plan.build import check_plan, effective_domain
 from lifecycle.plan.programs import Resolution, UnresolvedProgram
-from lifecycle.printable import count, json_text, lines
+from lifecycle.printable import count, lines
 
 TESTS = {
     "document": ("yaml.", "manifest.", "nodl."),
@@ -89,7 +90,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
         strict: what is unproven and what could not be resolved count as failures.
     """
     if format_ == "json":
-        return to_json(report).decode()
+        return json_of(report)
     if format_ == "sarif":
         return _sarif(report).rstrip("\n")
     if format_ == "junit":
@@ -227,7 +228,7 @@ def command(
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
     # Names of files are not ours to trust.
-    shown = {"text": lines, "github": lines, "json": json_text}
+    shown = {"text": lines, "github": lines}
     click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
 
@@ -240,7 +241,7 @@ def _list(path: str, format_: str, *, others: bool) -> int:
         )
     found = declared_arguments(path)
     if format_ == "json":
-        click.echo(json_text(to_json(found).decode()))
+        click.echo(json_of(found))
     else:
         text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
         click.echo(lines(text))
