@@ -182,11 +182,7 @@ def load_plan(
 
 
 def resolve(manifest: Manifest, machine: str = "") -> Resolution:
-    """Look for what the nodes of a manifest run, without running it.
-
-    Args:
-        manifest: valid.
-        machine: the machine that this host is; empty for all whose address is this host's.
+    """Look for what the nodes of a valid manifest run on this host, without running it.
 
     Raises:
         UsageError: the manifest declares no such machine.
@@ -379,11 +375,6 @@ def read_networks(
     targets: Sequence[str], given: Mapping[str, Any], *, option: str
 ) -> tuple[tuple[Chosen, ...], Treatment | None]:
     """Return the networks that were chosen, and what flows get; nothing where nothing was given.
-
-    Args:
-        targets: values of the option that chooses networks.
-        given: values of those that `network_options` adds beside it.
-        option: for messages, `--program`.
 
     Raises:
         UsageError: they do not fit together.

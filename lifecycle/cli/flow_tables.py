@@ -216,12 +216,7 @@ _DIGITS = 5
 
 
 def cells(flow: FlowMeasurement | None, *, colour: bool) -> tuple[str, str, str, str]:
-    """Return rate in hertz, p50 and p99 of the delay in milliseconds, and what was lost.
-
-    Args:
-        flow: None where nothing is measured.
-        colour: mark outcomes with ANSI colours.
-    """
+    """Return rate in hertz, p50 and p99 of the delay in milliseconds, and what was lost."""
     if flow is None:
         return ("–", "–", "–", "–")
     lost = "–" if flow.lost is None else f"{flow.lost}/{flow.messages + flow.lost}"
@@ -270,7 +265,6 @@ class Record:
         rows: how many were written.
 
     Args:
-        path: of the file.
         replaces: it may be there already.
 
     Raises:

@@ -74,10 +74,6 @@ class Launched(msgspec.Struct, kw_only=True):
 def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
 
-    Args:
-        path: the file.
-        arguments: launch arguments by name.
-
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
     """

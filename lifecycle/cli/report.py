@@ -118,12 +118,7 @@ def format_verdict(
 ) -> str:
     """Return `verdict` as "text", "json", "junit", "sarif" or "github" (text and annotations).
 
-    Args:
-        verdict: what to write.
-        plan: None where there is none, because the manifest cannot be used.
-        format_: see above.
-        colour: mark outcomes of text with ANSI colours.
-        strict: what cannot be verified counts as refused.
+    There is no plan where the manifest cannot be used.
     """
     from lifecycle.verify.report import render_text, to_github, to_json, to_junit, to_sarif
 
@@ -179,11 +174,7 @@ class ReportFile:
                 _replace(self._path, self._text(self._path, _unjudged(reason, ExitCode.INTERNAL)))
 
     def end(self, verdict: Verdict, plan: Plan | None = None) -> ExitCode:
-        """Write how it ended.
-
-        Args:
-            verdict: the last one.
-            plan: what it is of, where another manifest was taken since `begin`.
+        """Write how it ended, of another plan where one was taken since `begin`.
 
         Returns:
             See `write_report`.

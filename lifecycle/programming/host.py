@@ -99,13 +99,7 @@ class HostTool:
 
 
 def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
-    """Run a program that has to succeed and return what it printed.
-
-    Args:
-        tool: runs it.
-        argv: the command line.
-        doing: what fails with it, to follow "cannot": "write nftables table inet flowqos_x".
-        stdin: what it reads.
+    """Run a program that has to succeed and return what it printed; else it cannot do `doing`.
 
     Raises:
         ProgrammingError: see `failure`.
@@ -127,11 +121,6 @@ class Qdisc(msgspec.Struct, frozen=True, kw_only=True):
 
 def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
     """Return the queueing disciplines that `tc -j qdisc show` lists.
-
-    Args:
-        tool: runs it.
-        options: which ones, such as `dev eth0`.
-        doing: what fails with it, to follow "cannot".
 
     Raises:
         ProgrammingError: it failed, or what it prints is no such list.
@@ -212,13 +201,7 @@ def _fitting(comment: str) -> str:
 
 
 def render_table(table: str, lines: Iterable[str], *, priority: str = "mangle") -> str:
-    """Return commands for `nft -f` that replace a table in one transaction.
-
-    Args:
-        table: its name.
-        lines: of its chain.
-        priority: of its chain in the postrouting hook.
-    """
+    """Return commands for `nft -f` that replace a table in one transaction."""
     text = [
         f"table inet {table} {{",
         f'  comment "{_MANAGED}"',
@@ -257,11 +240,8 @@ class TableTarget(Target):
     """A table of one system, and what is beside it; both are written and removed as a whole.
 
     Args:
-        settings: of the target.
         means: their ledger says what was written, for who compares or removes it later.
-        table: its name.
         scope: names it in the ledger.
-        tool: runs nft, and tc.
 
     Attributes:
         gone: detail of a change because what was written is not there any more.

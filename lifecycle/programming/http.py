@@ -366,13 +366,8 @@ class Api:
 
         429 and 503 are asked again after Retry-After; 409 too, because a server may still be
         deleting what is in the way; other server errors and lost answers only where asking twice
-        is the same as asking once. A connection that could not be made is tried again.
-
-        Args:
-            method: HTTP method.
-            path: below `url`; starts with a slash.
-            body: sent as JSON.
-            may_be_gone: 404 and 410 are answers, not errors.
+        is the same as asking once. A connection that could not be made is tried again. 404 and 410
+        are answers where it `may_be_gone`.
 
         Raises:
             HttpError: refused, or still not done after all patience.

@@ -99,8 +99,6 @@ class Ledger:
     """One system's ledger.
 
     Args:
-        directory: of the run.
-        system: name of the system.
         owned: this process is the supervisor whose end is to end what it makes.
     """
 

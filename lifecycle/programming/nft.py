@@ -35,13 +35,7 @@ _WITHOUT_PRIORITY = {"pfifo_fast": _BANDS, "prio": _BANDS, "pfifo": _BLIND, "fq_
 
 
 class NftTarget(TableTarget):
-    """The table of one system.
-
-    Args:
-        settings: None, it takes none.
-        means: their ledger says that there is a table, for who removes it later.
-        tool: runs nft.
-    """
+    """The table of one system."""
 
     kind = "nft"
 

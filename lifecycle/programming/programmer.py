@@ -41,11 +41,7 @@ _DISCARD_PORT = 9
 
 
 def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
-    """Return what a person asked for.
-
-    Args:
-        mapping: name or file of a mapping; empty for none.
-        label_flows: see Treatment.
+    """Return what a person asked for; `mapping` is the name or the file of one, empty for none.
 
     Raises:
         UsageError: no such mapping, or its file cannot be used.
@@ -108,9 +104,6 @@ class Removal:
     """Removes everything of one run in networks, also what was applied manually.
 
     One thread removes, another cancels.
-
-    Args:
-        means: their ledger lists what is to be removed.
     """
 
     def __init__(self, means: Means) -> None:
@@ -148,11 +141,7 @@ class Programmer(Removal):
     """Programs targets with the verified flows of one system.
 
     Args:
-        plan: of the system.
-        targets: to keep in step.
-        means: what they were opened with.
         source_address: observes where publishers send from; None believes the manifest only.
-        treatment: what flows get beyond what the manifest says.
     """
 
     def __init__(

@@ -403,9 +403,7 @@ def expressed(
 ) -> tuple[list[tuple[FlowRule, T]], tuple[str, ...]]:
     """Return each rule with what a network makes of it, and the flows that it cannot express.
 
-    Args:
-        rules: of verified flows.
-        make: raises a ValueError with the reason where a rule cannot be expressed.
+    Where it cannot, `make` raises a ValueError with the reason.
     """
     made: list[tuple[FlowRule, T]] = []
     left_out: list[str] = []

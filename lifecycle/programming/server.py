@@ -98,11 +98,6 @@ def device_ends(rule: FlowRule, networks: Sequence[IpNetwork]) -> tuple[DeviceEn
 def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str:
     """Return what the operator calls the class that a flow asks for.
 
-    Args:
-        rule: of the flow.
-        names: by 5QI.
-        setting: name of `names` in the settings, for the message.
-
     Raises:
         ValueError: there is no name.
     """
@@ -149,7 +144,6 @@ class ServerTarget(Target):
 
     Args:
         settings: path of the settings file, so that a later run can remove what this one leaves.
-        means: see Means.
 
     Attributes:
         collection: path of all things, "/sessions"; without the slash, what an export calls them.

@@ -85,11 +85,7 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
         return any(each.kind is not ChangeKind.KEEP for each in self.changes)
 
     def render(self, *, done: bool = False) -> str:
-        """Return the changes as text, one line per flow.
-
-        Args:
-            done: they have been made.
-        """
+        """Return the changes as text, one line per flow; `done` if they were made."""
         kinds = [each.kind for each in self.changes]
         counts = [
             f"{number} {kind.value}d" if done else f"{number} to {kind.value}"
@@ -153,11 +149,7 @@ class Patience:
 
     @contextlib.contextmanager
     def within(self, seconds: float | None) -> Iterator[None]:
-        """Bound what is done inside; an outer bound holds as well.
-
-        Args:
-            seconds: from now; None sets no bound of its own. A negative one leaves no time.
-        """
+        """Bound what is done inside, None by nothing; an outer bound holds as well."""
         outer_s = self._until_s
         if seconds is not None:
             self._until_s = min(outer_s, time.monotonic() + seconds)
@@ -171,11 +163,7 @@ class Patience:
         return 0.0 if self.cancelled.is_set() else max(0.0, self._until_s - time.monotonic())
 
     def run(self, work: Coroutine[Any, Any, T], most_s: float) -> T:
-        """Run a coroutine to its end, for as long as there is time.
-
-        Args:
-            work: cancelled once there is no time left, or whatever else ends this.
-            most_s: for it alone, seconds.
+        """Run a coroutine to its end, or cancel it after `most_s`, or once there is no time left.
 
         Raises:
             TimeoutError: there was no time left.
@@ -217,7 +205,6 @@ class Target(abc.ABC):
 
     Args:
         settings: what `read` or `restore` returned.
-        means: see Means.
 
     Attributes:
         kind: name of the target.
@@ -316,11 +303,6 @@ def read_targets(
     names: Iterable[str], given: Mapping[str, Any], *, option: str = "--target"
 ) -> tuple[Chosen, ...]:
     """Return the targets that a person asked for, with their options.
-
-    Args:
-        names: of TARGETS.
-        given: values of options by name; what is missing, None or empty was not given.
-        option: what chose the targets, for messages.
 
     Raises:
         UsageError: they do not fit together.

@@ -284,13 +284,7 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
 
 
 class TcTarget(TableTarget):
-    """One device.
-
-    Args:
-        settings: of the device.
-        means: their ledger says that there is something, for who removes it later.
-        tool: runs tc and nft.
-    """
+    """One device."""
 
     kind = "tc"
     hint = "give --device eth0 --rate 20mbit"

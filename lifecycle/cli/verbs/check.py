@@ -84,10 +84,7 @@ class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
 def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     """Return a report as "text", "json", "sarif", "junit" or "github" (text and annotations).
 
-    Args:
-        report: what was found.
-        format_: see above.
-        strict: what is unproven and what could not be resolved count as failures.
+    What is unproven or could not be resolved is a failure if it is `strict`.
     """
     if format_ == "json":
         return json_of(report)
