@@ -1,8 +1,4 @@
-"""Options that several verbs share, loading a manifest, and finding a running system.
-
-Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs about a running system,
-`--format`, `--timeout`, and the options that say which networks to program and what flows get.
-"""
+"""Options that several verbs share, loading a manifest, and finding a running system."""
 
 from __future__ import annotations
 

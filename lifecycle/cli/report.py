@@ -1,8 +1,7 @@
 """`--report FILE`: a verdict in the format that the suffix says, whatever the command's end.
 
-Owns: which suffix means which format, and `ReportFile`: the file is emptied before anything is
-started, so that nothing old is taken for new, and written on every exit code. Imports next to
-nothing: it is opened before the rest of a command is imported.
+The file is emptied before anything is started, so that nothing old is taken for new, and written on
+every exit code. Imports next to nothing: it is opened before the rest of a command is imported.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them.
-
-Owns: the choice between them and the two line formats. Everything comes from the supervisor's
-events.
-"""
+"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
 """What targets on this host have in common: nft and tc are run, and nftables tables of ours kept.
 
-Owns: what refusals of the two programs mean, such as a missing privilege; the text of a table for
-`nft -f`; and `TableTarget`, which writes, compares and removes one. A table is replaced as a whole
-in one transaction, so no foreign object is ever touched; its comment says that it is ours. The
-ledger has what was written for each flow, and a digest of what nft showed afterwards: what differs
-from that was changed by others. Needs nftables 1.0.6 or later.
+A table is replaced as a whole in one transaction, so no foreign object is ever touched; its comment
+says that it is ours. The ledger has what was written for each flow, and a digest of what nft showed
+afterwards: what differs from that was changed by others. Needs nftables 1.0.6 or later.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Servers that are reached over HTTP: their settings file, and one request at a time.
 
-Owns: keys that every such target has, and where a token is: it is read at the moment it is needed,
-goes to one server only and into no log. Also which answers are tried again and when, that no server
-holds a request up past its deadline, and how a refusal and an answer that cannot be used read: an
-`HttpError` that names the request and the field. Knows nothing of what is asked for.
+A token is read at the moment it is needed, goes to one server only and into no log. No server holds
+a request up past its deadline; a refusal, and an answer that cannot be used, is an `HttpError` that
+names the request and the field.
 """
 
 from __future__ import annotations

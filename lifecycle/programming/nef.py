@@ -1,8 +1,6 @@
 """3GPP NEF AsSessionWithQoS over HTTP: one subscription per flow and device.
 
-Owns: the paths, methods and media types of TS 29.122 (release 17, API version 1.2.3) and how a
-server's view of a subscription is compared with ours; and our own model of the body, written from
-the specification's facts. Its schema does not look inside filter strings.
+By TS 29.122 (release 17, API version 1.2.3); its schema does not look inside filter strings.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """nftables on this host: the table `inet flowqos_<system>` marks the packets of verified flows.
 
-Owns: what is written into the packets of a rule, and the ruleset as an export. Packets are marked
-where they leave the host that sends them (postrouting, mangle). Only the six bits of the DSCP are
-written: ECN is the transport's (RFC 3168).
+They are marked where they leave the host that sends them (postrouting, mangle). Only the six bits
+of the DSCP are written: ECN is the transport's (RFC 3168).
 """
 
 from __future__ import annotations

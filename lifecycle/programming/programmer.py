@@ -1,9 +1,7 @@
-"""Keeps networks in step with the verified flows of one system.
+"""Keeps networks in step with the verified flows of one system: from reports to rules to targets.
 
-Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
-everything removed in the end; the address that this host sends from to a destination, as its
-routing decides; and the removal of what dead runs left. What was applied manually stays: `lifecycle
-flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+Also removes what dead runs left. What was applied manually stays: `lifecycle flows remove` or
+`lifecycle down` ends it. Blocking: a supervisor has a thread for it.
 """
 
 from __future__ import annotations

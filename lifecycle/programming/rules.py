@@ -1,10 +1,8 @@
-"""Turns verified flows into flow rules for networks, with the reason for each flow left out.
+"""Turns verified flows into flow rules for networks, with the reason for each flow left out. Pure.
 
-Owns: `FlowRule`, the step from flow reports to rules, and how a rule reads. A
-rule says only what was observed or declared: a flow whose verdict is not ok, shared memory, groups
-and tuples that two flows share in disagreement make no rule, and each is listed with its reason.
-Comments have DSCP and TOS always side by side, because products differ in which of the two they ask
-for. Pure.
+A rule says only what was observed or declared: a flow whose verdict is not ok, shared memory,
+groups and tuples that two flows share in disagreement make no rule. Comments have DSCP and TOS
+always side by side, because products differ in which of the two they ask for.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A target that keeps one thing per flow and device at a server: subscriptions, sessions.
 
-Owns: what NEF and CAMARA have in common: which ends of a flow are devices of the mobile network,
-each of which is asked for; the difference between rules, ledger and server, and the order in which
-it is made up for. A request is written down before it is sent, so that what was made is found again
-even if the answer was lost. What a thing is and how it is asked for is the target's.
+What NEF and CAMARA have in common: which ends of a flow are devices of the mobile network, and the
+difference between rules, ledger and server. A request is written down before it is sent, so that
+what was made is found again even if the answer was lost.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What a network target is, which there are, what it changes, and what can go wrong.
-
-Owns: `Target`, which plans, applies and removes; their answers as text; how long servers are waited
-for; the errors of this package. A target is imported on first use.
-"""
+"""What a network target is, what it changes, how long it is waited for, and what can go wrong."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`lifecycle apply`: another manifest for a running system, through the gate, or back.
-
-Owns: the verb, `ApplyReport` and how it is said, and which running system a manifest is for.
-"""
+"""`lifecycle apply`: another manifest for a running system, through the gate, or back."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`lifecycle status`, `down`, `pause`, `resume` and `restart`: the verbs that talk to a supervisor.
-
-Owns: how an order is given and what its outcome is as an exit code; a status as plain text.
-"""
+"""`lifecycle status`, `down`, `pause`, `resume`, `restart` and `mode`: they ask a supervisor."""
 
 from __future__ import annotations
 

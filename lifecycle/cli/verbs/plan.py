@@ -1,7 +1,4 @@
-"""`lifecycle plan` and `lifecycle ports`: what a manifest becomes, and DDS port arithmetic.
-
-Owns: the verbs and what `ports` prints; the arithmetic is `lifecycle.network`'s.
-"""
+"""`lifecycle plan` and `lifecycle ports`: what a manifest becomes, and DDS port arithmetic."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """`lifecycle run MANIFEST NODE`: one node of a manifest in this terminal, without a supervisor.
 
-Owns: finding the node in the plan; a node that is not a Python class replaces this process.
+A node that is not a Python class replaces this process.
 """
 
 from __future__ import annotations
