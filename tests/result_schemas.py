@@ -19,7 +19,7 @@ import msgspec
 
 from lifecycle.cli.verbs.apply import ApplyReport
 from lifecycle.cli.verbs.check import CheckReport
-from lifecycle.export.picture.model import Picture
+from lifecycle.export.picture import Picture
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest import written
 from lifecycle.manifest.model import Dscp

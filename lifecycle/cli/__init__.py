@@ -1,7 +1,7 @@
-"""The command line: one file per verb, thin. Owns argument parsing and the one error boundary.
+"""The command line: the table of verbs, their options' errors, and the one error boundary.
 
-`VERBS` is the table of all verbs. A verb's module is imported only when it is used, so that verbs
-that need no ROS start fast; its function returns an exit code (None means 0).
+A verb's module is imported only when it is used, so that verbs that need no ROS start fast; its
+function returns an exit code (None means 0).
 """
 
 from __future__ import annotations

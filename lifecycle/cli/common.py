@@ -1,8 +1,4 @@
-"""Options that several verbs share, loading a manifest, and finding a running system.
-
-Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs about a running system,
-`--format`, `--timeout`, and the options that say which networks to program and what flows get.
-"""
+"""Options that several verbs share, loading a manifest, and finding a running system."""
 
 from __future__ import annotations
 
@@ -18,12 +14,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
+from lifecycle.codec import to_json
 from lifecycle.errors import UsageError, did_you_mean
-from lifecycle.printable import lines
+from lifecycle.printable import json_text, lines
 from lifecycle.programming import TARGETS
 
 if TYPE_CHECKING:
-    from lifecycle.manifest.loading import Loaded
     from lifecycle.manifest.model import Manifest
     from lifecycle.plan.model import Plan
     from lifecycle.plan.programs import Resolution
@@ -141,15 +137,16 @@ def run_commands_option(function: F) -> F:
     )(function)
 
 
-def load_manifest(
+def load_plan(
     path: str,
     assignments: tuple[str, ...],
     *,
     quiet: bool = False,
     machine: str | None = None,
     run_commands: bool = True,
-) -> Loaded:
-    """Load and check a manifest; print warnings to stderr unless `quiet`.
+    domain_id: int | None = None,
+) -> Plan:
+    """Load and check a manifest, and plan it; print warnings to stderr unless `quiet`.
 
     Args:
         path: the file.
@@ -158,12 +155,14 @@ def load_manifest(
         machine: what its nodes run is looked for, too, as `up --machine` would start it; None looks
             for nothing.
         run_commands: see `load`.
+        domain_id: in the place of the manifest's.
 
     Raises:
         ManifestError: with every diagnostic.
     """
     from lifecycle.manifest.diagnostics import ManifestError, Severity
     from lifecycle.manifest.loading import load
+    from lifecycle.plan.build import build_plan
 
     loaded = load(path, parse_assignments(assignments), run_commands=run_commands)
     warnings = loaded.warnings
@@ -175,32 +174,11 @@ def load_manifest(
     if not quiet:
         for warning in warnings:
             click.echo(lines(str(warning)), err=True)
-    return loaded
-
-
-def load_plan(
-    path: str,
-    assignments: tuple[str, ...],
-    *,
-    quiet: bool = False,
-    machine: str | None = None,
-    run_commands: bool = True,
-) -> Plan:
-    """Load a manifest as `load_manifest` does, and return its plan."""
-    from lifecycle.plan.build import build_plan
-
-    loaded = load_manifest(
-        path, assignments, quiet=quiet, machine=machine, run_commands=run_commands
-    )
-    return build_plan(loaded.manifest)
+    return build_plan(loaded.manifest, domain_id=domain_id)
 
 
 def resolve(manifest: Manifest, machine: str = "") -> Resolution:
-    """Look for what the nodes of a manifest run, without running it.
-
-    Args:
-        manifest: valid.
-        machine: the machine that this host is; empty for all whose address is this host's.
+    """Look for what the nodes of a valid manifest run on this host, without running it.
 
     Raises:
         UsageError: the manifest declares no such machine.
@@ -210,6 +188,11 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
 
     own = own_machines(manifest, machine)
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
+
+
+def json_of(value: object) -> str:
+    """Return a value as JSON that a terminal can show."""
+    return json_text(to_json(value).decode())
 
 
 def output_option(what: str) -> Callable[[F], F]:
@@ -232,8 +215,13 @@ def write_text(path: Path, text: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_text(path, text)
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"cannot write {str(path)!r}: {why}") from error
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError | ValueError, what: str = "") -> UsageError:
+    """Return the error for a file that cannot be written; `what` says which it is."""
+    why = error.strerror if isinstance(error, OSError) else error
+    return UsageError(f"cannot write {what}{str(path)!r}: {why}")
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -383,11 +371,6 @@ def read_networks(
     targets: Sequence[str], given: Mapping[str, Any], *, option: str
 ) -> tuple[tuple[Chosen, ...], Treatment | None]:
     """Return the networks that were chosen, and what flows get; nothing where nothing was given.
-
-    Args:
-        targets: values of the option that chooses networks.
-        given: values of those that `network_options` adds beside it.
-        option: for messages, `--program`.
 
     Raises:
         UsageError: they do not fit together.

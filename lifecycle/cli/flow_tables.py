@@ -17,14 +17,13 @@ from typing import Any
 
 from msgspec.structs import asdict, replace
 
-from lifecycle.cli.common import terminal_width, wrapped
-from lifecycle.codec import to_json
+from lifecycle.cli.common import json_of, terminal_width, unwritable, wrapped
 from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement, Kind, Pair, measured_summary
 from lifecycle.network.dscp import describe, dscp_name, tos
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.printable import columns, json_text, lines, one_line, shown_length
+from lifecycle.printable import columns, lines, one_line, shown_length
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport, Verdict
 
@@ -67,7 +66,7 @@ def render_flows(
     flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
     if format_ == "json":
         documents = [{**asdict(each), "measured": found.get(each.pair)} for each in flows]
-        return json_text(to_json(documents).decode())
+        return json_of(documents)
     if format_ == "csv":
         return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
     if not flows:
@@ -216,12 +215,7 @@ _DIGITS = 5
 
 
 def cells(flow: FlowMeasurement | None, *, colour: bool) -> tuple[str, str, str, str]:
-    """Return rate in hertz, p50 and p99 of the delay in milliseconds, and what was lost.
-
-    Args:
-        flow: None where nothing is measured.
-        colour: mark outcomes with ANSI colours.
-    """
+    """Return rate in hertz, p50 and p99 of the delay in milliseconds, and what was lost."""
     if flow is None:
         return ("–", "–", "–", "–")
     lost = "–" if flow.lost is None else f"{flow.lost}/{flow.messages + flow.lost}"
@@ -270,7 +264,6 @@ class Record:
         rows: how many were written.
 
     Args:
-        path: of the file.
         replaces: it may be there already.
 
     Raises:
@@ -289,7 +282,7 @@ class Record:
                 hint="name another file, or replace it with --force",
             ) from error
         except (OSError, ValueError) as error:
-            raise self._unwritable(error) from error
+            raise unwritable(self.path, error) from error
         self._writer = csv.writer(self._file, lineterminator="\n")
         try:
             self._write([RECORDED])
@@ -316,11 +309,7 @@ class Record:
             self._writer.writerows(rows)
             self._file.flush()
         except OSError as error:
-            raise self._unwritable(error) from error
-
-    def _unwritable(self, error: OSError | ValueError) -> UsageError:
-        why = error.strerror if isinstance(error, OSError) else error
-        return UsageError(f"cannot write {str(self.path)!r}: {why}")
+            raise unwritable(self.path, error) from error
 
     def close(self) -> None:
         """Write no more; what could not be written was said."""

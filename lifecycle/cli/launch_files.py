@@ -1,9 +1,8 @@
 """Evaluates a launch description without starting anything, and writes its nodes as a manifest.
 
-Owns: which actions of `launch` and `launch_ros` are carried out while one is evaluated (those that
-only set something for what follows), which are read instead of run (processes, nodes, timers, event
-handlers), and how each becomes a key of the manifest or a `gap:`. A launch file in Python is a
-program, which evaluating it runs, and so does a `Command` substitution.
+Actions that only set something for what follows are carried out; processes, nodes, timers and event
+handlers are read instead of run. A launch file in Python is a program, which evaluating it runs,
+and so does a `Command` substitution.
 """
 
 from __future__ import annotations
@@ -73,10 +72,6 @@ class Launched(msgspec.Struct, kw_only=True):
 
 def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
-
-    Args:
-        path: the file.
-        arguments: launch arguments by name.
 
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.

@@ -1,8 +1,7 @@
 """`--report FILE`: a verdict in the format that the suffix says, whatever the command's end.
 
-Owns: which suffix means which format, and `ReportFile`: the file is emptied before anything is
-started, so that nothing old is taken for new, and written on every exit code. Imports next to
-nothing: it is opened before the rest of a command is imported.
+The file is emptied before anything is started, so that nothing old is taken for new, and written on
+every exit code. Imports next to nothing: it is opened before the rest of a command is imported.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import replace
 
-from lifecycle.cli.common import replace_text
+from lifecycle.cli.common import replace_text, unwritable
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import count, lines
 
@@ -65,33 +64,28 @@ def open_report(path: Path) -> None:
         elif not os.access(path, os.W_OK):
             raise PermissionError(13, "Permission denied")
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise unwritable(path, error, "report ") from error
 
 
-def write_report(path: Path, text: str) -> None:
-    """Replace what is in a report: half of one might read as a success.
-
-    Raises:
-        UsageError: it cannot be written any more.
-    """
-    try:
-        replace_text(path, text.rstrip("\n") + "\n")
-    except OSError as error:
-        raise _unwritable(path, error) from error
-
-
-def written_or_said(write: Callable[[], None]) -> ExitCode:
-    """Write a report of what is known by now, whose exit code must not be lost over it.
+def write_report(path: Path, text: str) -> ExitCode:
+    """Replace what is in a report, half of which might read as a success.
 
     Returns:
-        USAGE where it cannot be written, which then has been said: no success.
+        USAGE where it cannot be written any more, which then has been said: no success.
     """
     try:
-        write()
+        _replace(path, text)
     except UsageError as error:
         click.echo(lines(str(error)), err=True)
         return ExitCode.USAGE
     return ExitCode.OK
+
+
+def _replace(path: Path, text: str) -> None:
+    try:
+        replace_text(path, text.rstrip("\n") + "\n")
+    except OSError as error:
+        raise unwritable(path, error, "report ") from error
 
 
 def report_option(function: F) -> F:
@@ -123,12 +117,7 @@ def format_verdict(
 ) -> str:
     """Return `verdict` as "text", "json", "junit", "sarif" or "github" (text and annotations).
 
-    Args:
-        verdict: what to write.
-        plan: None where there is none, because the manifest cannot be used.
-        format_: see above.
-        colour: mark outcomes of text with ANSI colours.
-        strict: what cannot be verified counts as refused.
+    There is no plan where the manifest cannot be used.
     """
     from lifecycle.verify.report import render_text, to_github, to_json, to_junit, to_sarif
 
@@ -180,18 +169,20 @@ class ReportFile:
         self._plan = plan
         if not self._waits:
             reason = "it never came to its end: the process was killed"
-            self._write(_unjudged(reason, ExitCode.INTERNAL))
+            if self._path is not None:
+                _replace(self._path, self._text(self._path, _unjudged(reason, ExitCode.INTERNAL)))
 
-    def end(self, verdict: Verdict, plan: Plan | None = None) -> None:
-        """Write how it ended.
+    def end(self, verdict: Verdict, plan: Plan | None = None) -> ExitCode:
+        """Write how it ended, of another plan where one was taken since `begin`.
 
-        Args:
-            verdict: the last one.
-            plan: what it is of, where another manifest was taken since `begin`.
+        Returns:
+            See `write_report`.
         """
         self._ended = True
         self._plan = plan or self._plan
-        self._write(verdict)
+        if self._path is None:
+            return ExitCode.OK
+        return write_report(self._path, self._text(self._path, verdict))
 
     def __exit__(
         self,
@@ -199,20 +190,11 @@ class ReportFile:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is None or self._ended or self._path is None:
-            return
-        try:
-            self._write(_verdict_of(error))
-        except UsageError as unwritable:
-            # What went wrong first decides the exit code.
-            click.echo(str(unwritable), err=True)
+        if error is not None and not self._ended:
+            self.end(_verdict_of(error))
 
-    def _write(self, verdict: Verdict) -> None:
-        """Replace what is in the file; raises UsageError if it cannot be written any more."""
-        if self._path is not None:
-            format_ = report_format(self._path)
-            text = format_verdict(verdict, self._plan, format_, strict=self._strict)
-            write_report(self._path, text)
+    def _text(self, path: Path, verdict: Verdict) -> str:
+        return format_verdict(verdict, self._plan, report_format(path), strict=self._strict)
 
 
 def _verdict_of(error: BaseException) -> Verdict:
@@ -265,7 +247,3 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
 def _is_stream(path: Path) -> bool:
     """Whether it is a pipe or a terminal, which is written once, in the end."""
     return path.exists() and not (path.is_file() or path.is_dir())
-
-
-def _unwritable(path: Path, error: OSError) -> UsageError:
-    return UsageError(f"cannot write report {str(path)!r}: {error.strerror}")

@@ -100,9 +100,6 @@ class Streams:
         """Write what is left and return the exit code: no success if its result was lost.
 
         A reader that went away, as `head` does, has read what it wanted.
-
-        Args:
-            code: of the verb.
         """
         sys.stdout.flush()
         error = self._stdout.error
@@ -119,10 +116,8 @@ def own_streams(*, waits: bool = True) -> Streams:
     """Have only `sys.stdout` write to standard output, and no failure of it or stderr raise.
 
     What writes to descriptor 1 itself, as C++ does, comes out on standard error; so does what child
-    processes print that are given no other. A stream that is closed becomes one to nowhere.
-
-    Args:
-        waits: for readers of standard error; else what they do not read in time is dropped.
+    processes print that are given no other. A stream that is closed becomes one to nowhere. Unless
+    it `waits`, what readers of standard error do not read in time is dropped.
     """
     _open_closed()
     stdout = _Tolerant(os.dup(_STDOUT))
@@ -212,11 +207,9 @@ class Writer:
     take is lost, and both are counted and said in the stream once there is room again.
 
     Args:
-        descriptor: where to.
         name: of the stream, for messages.
         marker: makes the note in the stream from a message about the loss.
         say: takes messages that the stream itself cannot take, from any thread.
-        encoding: of the texts.
 
     Raises:
         MiddlewareError: there is no room for another thread.
@@ -255,12 +248,7 @@ class Writer:
             raise no_room_for_threads(1) from error
 
     def put(self, text: str, *, kept: bool = True) -> None:
-        """Write a text, whole lines, once there is room for it.
-
-        Args:
-            text: what to write.
-            kept: False for a log line.
-        """
+        """Write whole lines once there is room for them; a log line is not `kept` as long."""
         size = len(data := text.encode(self._encoding, "backslashreplace"))
         with self._changed:
             if self._gone or self._closing:

@@ -1,8 +1,4 @@
-"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them.
-
-Owns: the choice between them and the two line formats. Everything comes from the supervisor's
-events.
-"""
+"""Output of `lifecycle up`: JSON lines, plain lines, and on a terminal a line below them."""
 
 from __future__ import annotations
 
@@ -13,7 +9,6 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import click
 
@@ -60,6 +55,9 @@ _AGAIN_S = 1.0
 
 class RunOutput:
     """A listener that also shows how the run ended."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
@@ -110,9 +108,6 @@ def _json_notice(text: str) -> str:
 class JsonLines(RunOutput):
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-
     def __call__(self, event: Event) -> None:
         """Write one event."""
         self._writer.put(_json_line(event), kept=not isinstance(event, LogLine))
@@ -123,41 +118,29 @@ class JsonLines(RunOutput):
         self._writer.close()
 
 
-class Rollback:
-    """Which lines of processes bury the cause of a failed run, once it is rolled back.
-
-    They are what processes write that are ended because of another's failure: all of it is in their
-    log files.
-    """
-
-    def __init__(self) -> None:
-        self._failed: set[str] = set()
-        self._ended: set[str] = set()
-
-    def hides(self, event: Event) -> bool:
-        """Take the next event; whether a person is spared it."""
-        if isinstance(event, Failure) and event.ends_run:
-            self._failed.add(event.process)
-        elif isinstance(event, ProcessChanged) and event.state is ProcessState.STOPPING:
-            self._ended.add(event.process)
-        elif isinstance(event, LogLine):
-            mine = event.process in self._failed
-            return bool(self._failed) and event.process in self._ended and not mine
-        return False
-
-
 class Narrator:
     """Gives the line of each event of one run, and none where it repeats the one before.
 
     States that a node passes through because we ask it to have no lines: how far it is says enough.
+    Nor has what processes write that are ended because of another's failure, whose cause it would
+    bury: all of it is in their log files.
     """
 
     def __init__(self) -> None:
         self._reached: dict[str, Reach] = {}
         self._asked: set[str] = set()
+        self._failed: set[str] = set()
+        self._ended: set[str] = set()
 
     def line(self, event: Event) -> str | None:
         """Return the line about the next event; None if it has none."""
+        if isinstance(event, Failure) and event.ends_run:
+            self._failed.add(event.process)
+        elif isinstance(event, ProcessChanged) and event.state is ProcessState.STOPPING:
+            self._ended.add(event.process)
+        elif isinstance(event, LogLine) and self._failed:
+            buries = event.process in self._ended - self._failed
+            return None if buries else describe(event)
         if isinstance(event, RequestSent):
             self._asked.add(event.node)
         if isinstance(event, NodeChanged):
@@ -178,17 +161,15 @@ class PlainLines(RunOutput):
     """One line per event, for logs and pipes."""
 
     def __init__(self, writer: Writer, *, colour: bool = False, width: int = 100) -> None:
-        self._writer = writer
+        super().__init__(writer)
         self._colour = colour
         self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
-        self._rollback = Rollback()
 
     def __call__(self, event: Event) -> None:
         """Write one event, if it has a line for people."""
-        hidden = self._rollback.hides(event)
         line = self._narrator.line(event)
         if isinstance(event, SystemReached):
             self._active = event.reached == "active"
@@ -200,7 +181,7 @@ class PlainLines(RunOutput):
             if line == self._judged:
                 return
             self._judged = line
-        if line is not None and not hidden:
+        if line is not None:
             self._put(line + "\n", kept=not isinstance(event, LogLine))
 
     def finish(self, result: UpResult) -> None:
@@ -258,22 +239,88 @@ class TerminalLines(PlainLines):
 
 def describe(event: Event) -> str | None:
     """Return the line about `event` for people, printable; None if it has none."""
-    line = _LINES.get(type(event))
-    if line is None:
-        return None
-    return (log_line if isinstance(event, LogLine) else one_line)(line(event))
+    if isinstance(event, LogLine):
+        return log_line(f"[{event.process}] {event.line}")
+    text = _sentence(event)
+    return None if text is None else one_line(text)
 
 
-def _process_changed(event: ProcessChanged) -> str:
-    pid = f" (pid {event.pid})" if event.pid else ""
-    return f"process {event.process}: {event.state.value}{pid}" + (
-        f", {event.detail}" if event.detail else ""
-    )
-
-
-def _node_changed(event: NodeChanged) -> str:
-    but = f", but {event.state}" if _is_lost(event) else ""
-    return f"{event.node}: {event.reach.value}{but}"
+def _sentence(event: Event) -> str | None:  # noqa: PLR0911, PLR0912 - one case for each kind
+    match event:
+        case RunStarted():
+            return (
+                f"{event.system}: {count(len(event.nodes), 'node')} in "
+                f"{count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
+                f"discovery range {event.discovery_range}; logs in {event.log_directory}"
+            )
+        case ProcessChanged():
+            pid = f" (pid {event.pid})" if event.pid else ""
+            detail = f", {event.detail}" if event.detail else ""
+            return f"process {event.process}: {event.state.value}{pid}{detail}"
+        case NodeChanged():
+            but = f", but {event.state}" if _is_lost(event) else ""
+            return f"{event.node}: {event.reach.value}{but}"
+        case WiringChanged():
+            return _wiring_changed(event)
+        case WiringLost():
+            what = f"{event.endpoint} on " if event.endpoint else ""
+            return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
+        case NodeSilent():
+            return f"{event.node}: silent; {event.message}"
+        case NodeAlive(there=True):
+            return f"{event.node}: alive again after {event.silent_s:.1f} s"
+        case NodeAlive():
+            after = f"not silent any more after {event.silent_s:.1f} s"
+            return f"{event.node}: {after}, but not there yet"
+        case MachineConnection(established=True):
+            again = f" again after {event.lost_s:.1f} s" if event.lost_s else ""
+            return f"machine {event.machine}: connected{again}"
+        case MachineConnection():
+            what = "was shut down by its supervisor" if event.left else "connection lost"
+            return f"machine {event.machine}: {what}"
+        case VerdictChanged():
+            waits = missing(event.verdict)
+            if waits and event.stage is Stage.CONNECTED:
+                return f"not verified yet; {waits}"
+            return f"{event.stage.value}: {verdict_line(event.verdict)}"
+        case GateOpened():
+            trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
+            activating = f"activating {count(len(event.nodes), 'node')}"
+            return f"gate open on verdict {event.outcome}: {activating}{trusted}"
+        case SystemReached():
+            return f"system {event.reached} after {event.elapsed_s:.2f} s"
+        case Failure():
+            # What ends the run comes first in the last verdict; once is enough.
+            named = f"failed: {event.subject} ({event.rule})"
+            return named if event.ends_run else f"{named}: {event.message}"
+        case RestartScheduled():
+            last = f"; its last line: {event.stderr}" if event.stderr else ""
+            others = len(event.nodes) - 1
+            with_it = f" with {count(others, 'other node')}" if others else ""
+            return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
+        case Restarted():
+            return (
+                f"{event.process} is back {event.took_s:.2f} s after its failure; "
+                f"restarted {count(event.restarts, 'time')}"
+            )
+        case GaveUp():
+            return f"gave up {event.process} after {count(len(event.history), 'failure')}"
+        case ConsequenceTaken():
+            whom = f" {', '.join(event.nodes)}" if event.nodes else ""
+            return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
+        case ModeEntered():
+            without = f", without {', '.join(event.inactive)}" if event.inactive else ""
+            given = ", ".join(event.parameters)
+            return f"mode {event.mode}{without}{f', other parameters of {given}' if given else ''}"
+        case ManifestApplied():
+            return _manifest_applied(event)
+        case Notice():
+            return event.message
+        case Stopping():
+            return f"stopping: {event.reason}"
+        case Stopped():
+            return f"stopped after {event.elapsed_s:.2f} s"
+    return None
 
 
 def _is_lost(event: NodeChanged) -> bool:
@@ -292,62 +339,6 @@ def _wiring_changed(event: WiringChanged) -> str:
     return f"{event.node}: disconnected from {event.connection}"
 
 
-def _wiring_lost(event: WiringLost) -> str:
-    what = f"{event.endpoint} on " if event.endpoint else ""
-    return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
-
-
-def _node_alive(event: NodeAlive) -> str:
-    if not event.there:
-        return f"{event.node}: not silent any more after {event.silent_s:.1f} s, but not there yet"
-    return f"{event.node}: alive again after {event.silent_s:.1f} s"
-
-
-def _machine_connection(event: MachineConnection) -> str:
-    if not event.established:
-        what = "was shut down by its supervisor" if event.left else "connection lost"
-        return f"machine {event.machine}: {what}"
-    again = f" again after {event.lost_s:.1f} s" if event.lost_s else ""
-    return f"machine {event.machine}: connected{again}"
-
-
-def _verdict_changed(event: VerdictChanged) -> str:
-    waits = missing(event.verdict)
-    if waits and event.stage is Stage.CONNECTED:
-        return f"not verified yet; {waits}"
-    return f"{event.stage.value}: {verdict_line(event.verdict)}"
-
-
-def _gate_opened(event: GateOpened) -> str:
-    trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
-    activating = f"activating {count(len(event.nodes), 'node')}"
-    return f"gate open on verdict {event.outcome}: {activating}{trusted}"
-
-
-def _failure(event: Failure) -> str:
-    # What ends the run comes first in the last verdict; once is enough.
-    named = f"failed: {event.subject} ({event.rule})"
-    return named if event.ends_run else f"{named}: {event.message}"
-
-
-def _restart_scheduled(event: RestartScheduled) -> str:
-    last = f"; its last line: {event.stderr}" if event.stderr else ""
-    others = len(event.nodes) - 1
-    with_it = f" with {count(others, 'other node')}" if others else ""
-    return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
-
-
-def _consequence_taken(event: ConsequenceTaken) -> str:
-    whom = f" {', '.join(event.nodes)}" if event.nodes else ""
-    return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
-
-
-def _mode_entered(event: ModeEntered) -> str:
-    without = f", without {', '.join(event.inactive)}" if event.inactive else ""
-    others = f", other parameters of {', '.join(event.parameters)}" if event.parameters else ""
-    return f"mode {event.mode}{without}{others}"
-
-
 def _manifest_applied(event: ManifestApplied) -> str:
     what = {
         "added": event.added,
@@ -363,40 +354,6 @@ def _manifest_applied(event: ManifestApplied) -> str:
         "rolled_back": f"the manifest before is in force again, revision {event.revision}",
     }
     return said[event.stage]
-
-
-_LINES: dict[type[Event], Callable[[Any], str]] = {
-    RunStarted: lambda event: (
-        f"{event.system}: {count(len(event.nodes), 'node')} in "
-        f"{count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
-        f"discovery range {event.discovery_range}; logs in {event.log_directory}"
-    ),
-    ProcessChanged: _process_changed,
-    NodeChanged: _node_changed,
-    WiringChanged: _wiring_changed,
-    WiringLost: _wiring_lost,
-    NodeSilent: lambda event: f"{event.node}: silent; {event.message}",
-    NodeAlive: _node_alive,
-    MachineConnection: _machine_connection,
-    LogLine: lambda event: f"[{event.process}] {event.line}",
-    VerdictChanged: _verdict_changed,
-    GateOpened: _gate_opened,
-    SystemReached: lambda event: f"system {event.reached} after {event.elapsed_s:.2f} s",
-    Failure: _failure,
-    RestartScheduled: _restart_scheduled,
-    Restarted: lambda event: (
-        f"{event.process} is back {event.took_s:.2f} s after its failure; "
-        f"restarted {count(event.restarts, 'time')}"
-    ),
-    GaveUp: lambda event: f"gave up {event.process} after {count(len(event.history), 'failure')}",
-    ConsequenceTaken: _consequence_taken,
-    ModeEntered: _mode_entered,
-    ManifestApplied: _manifest_applied,
-    Notice: lambda event: event.message,
-    Stopping: lambda event: f"stopping: {event.reason}",
-    Stopped: lambda event: f"stopped after {event.elapsed_s:.2f} s",
-}
-"""Event → its line; those that are missing have none."""
 
 
 def verdict_line(verdict: Verdict) -> str:

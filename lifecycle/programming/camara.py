@@ -1,8 +1,4 @@
-"""CAMARA QualityOnDemand over HTTP: one session per flow and device, renewed before it expires.
-
-Owns: the paths of QualityOnDemand 1.1.0, its bodies, the states of a session and when it is
-prolonged.
-"""
+"""CAMARA QualityOnDemand 1.1.0: one session per flow and device, renewed before it expires."""
 
 from __future__ import annotations
 

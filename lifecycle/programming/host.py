@@ -1,10 +1,8 @@
 """What targets on this host have in common: nft and tc are run, and nftables tables of ours kept.
 
-Owns: what refusals of the two programs mean, such as a missing privilege; the text of a table for
-`nft -f`; and `TableTarget`, which writes, compares and removes one. A table is replaced as a whole
-in one transaction, so no foreign object is ever touched; its comment says that it is ours. The
-ledger has what was written for each flow, and a digest of what nft showed afterwards: what differs
-from that was changed by others. Needs nftables 1.0.6 or later.
+A table is replaced as a whole in one transaction, so no foreign object is ever touched; its comment
+says that it is ours. The ledger has what was written for each flow, and a digest of what nft showed
+afterwards: what differs from that was changed by others. Needs nftables 1.0.6 or later.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from lifecycle.codec import from_json
 from lifecycle.errors import UsageError
 from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed, named
+from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -33,7 +31,6 @@ from lifecycle.programming.target import (
     ProgrammingError,
     Target,
     TargetChanges,
-    describe_rule,
 )
 from lifecycle.run_directory import OWN_CHILD
 
@@ -100,13 +97,7 @@ class HostTool:
 
 
 def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
-    """Run a program that has to succeed and return what it printed.
-
-    Args:
-        tool: runs it.
-        argv: the command line.
-        doing: what fails with it, to follow "cannot": "write nftables table inet flowqos_x".
-        stdin: what it reads.
+    """Run a program that has to succeed and return what it printed; else it cannot do `doing`.
 
     Raises:
         ProgrammingError: see `failure`.
@@ -128,11 +119,6 @@ class Qdisc(msgspec.Struct, frozen=True, kw_only=True):
 
 def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
     """Return the queueing disciplines that `tc -j qdisc show` lists.
-
-    Args:
-        tool: runs it.
-        options: which ones, such as `dev eth0`.
-        doing: what fails with it, to follow "cannot".
 
     Raises:
         ProgrammingError: it failed, or what it prints is no such list.
@@ -213,13 +199,7 @@ def _fitting(comment: str) -> str:
 
 
 def render_table(table: str, lines: Iterable[str], *, priority: str = "mangle") -> str:
-    """Return commands for `nft -f` that replace a table in one transaction.
-
-    Args:
-        table: its name.
-        lines: of its chain.
-        priority: of its chain in the postrouting hook.
-    """
+    """Return commands for `nft -f` that replace a table in one transaction."""
     text = [
         f"table inet {table} {{",
         f'  comment "{_MANAGED}"',
@@ -258,11 +238,8 @@ class TableTarget(Target):
     """A table of one system, and what is beside it; both are written and removed as a whole.
 
     Args:
-        settings: of the target.
         means: their ledger says what was written, for who compares or removes it later.
-        table: its name.
         scope: names it in the ledger.
-        tool: runs nft, and tc.
 
     Attributes:
         gone: detail of a change because what was written is not there any more.
@@ -345,7 +322,7 @@ class TableTarget(Target):
     def export(self, rules: RuleSet) -> str:
         """Return a file that programs a host, and says in comments what is left out of it."""
         placed, left_out = expressed(rules.rules, self.lines)
-        remarks = [f"# {named(each)}: {each.describe()}: {asks(each)}" for each in rules.rules]
+        remarks = [f"# {each.named}: {each.describe()}: {each.asks}" for each in rules.rules]
         remarks += [f"# left out: {each}" for each in (*rules.left_out, *left_out)]
         return self.script(self.wanted(placed), remarks)
 
@@ -382,7 +359,7 @@ class TableTarget(Target):
         except ValueError as error:
             raise ProgrammingError(str(error)) from error
         entries = tuple(
-            Entry(key=rule.key, what=describe_rule(rule), body="\n".join(lines))
+            Entry(key=rule.key, what=f"{rule.describe()}, {rule.asks}", body="\n".join(lines))
             for rule, lines in placed
         )
         if write and not entries:

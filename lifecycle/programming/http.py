@@ -1,9 +1,8 @@
 """Servers that are reached over HTTP: their settings file, and one request at a time.
 
-Owns: keys that every such target has, and where a token is: it is read at the moment it is needed,
-goes to one server only and into no log. Also which answers are tried again and when, that no server
-holds a request up past its deadline, and how a refusal and an answer that cannot be used read: an
-`HttpError` that names the request and the field. Knows nothing of what is asked for.
+A token is read at the moment it is needed, goes to one server only and into no log. No server holds
+a request up past its deadline; a refusal, and an answer that cannot be used, is an `HttpError` that
+names the request and the field.
 """
 
 from __future__ import annotations
@@ -366,13 +365,8 @@ class Api:
 
         429 and 503 are asked again after Retry-After; 409 too, because a server may still be
         deleting what is in the way; other server errors and lost answers only where asking twice
-        is the same as asking once. A connection that could not be made is tried again.
-
-        Args:
-            method: HTTP method.
-            path: below `url`; starts with a slash.
-            body: sent as JSON.
-            may_be_gone: 404 and 410 are answers, not errors.
+        is the same as asking once. A connection that could not be made is tried again. 404 and 410
+        are answers where it `may_be_gone`.
 
         Raises:
             HttpError: refused, or still not done after all patience.

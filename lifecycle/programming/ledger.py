@@ -1,8 +1,7 @@
 """The ledger: what this package made in networks, written down before and after it is made.
 
-Owns: the file `programmed.json` in a run directory. It outlives the process, so that a removal
-deletes only what is ours, and the next run finds what a dead one left. It has what each flow was
-given, and of servers the id of what was made; never a credential.
+The file `programmed.json` in a run directory outlives the process, so that a removal deletes only
+what is ours, and the next run finds what a dead one left. It never has a credential.
 """
 
 from __future__ import annotations
@@ -99,8 +98,6 @@ class Ledger:
     """One system's ledger.
 
     Args:
-        directory: of the run.
-        system: name of the system.
         owned: this process is the supervisor whose end is to end what it makes.
     """
 

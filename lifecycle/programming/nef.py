@@ -1,8 +1,6 @@
 """3GPP NEF AsSessionWithQoS over HTTP: one subscription per flow and device.
 
-Owns: the paths, methods and media types of TS 29.122 (release 17, API version 1.2.3) and how a
-server's view of a subscription is compared with ours; and our own model of the body, written from
-the specification's facts. Its schema does not look inside filter strings.
+By TS 29.122 (release 17, API version 1.2.3); its schema does not look inside filter strings.
 """
 
 from __future__ import annotations
@@ -77,8 +75,8 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
 def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
     """Return IPFilterRule text (RFC 6733 §4.3.1) in the shape of 3GPP TS 29.214 §5.3.8."""
     device, server = f"{end.device} {end.device_port}", f"{end.server} {end.server_port}"
-    by_name = settings.protocol_by_name
-    protocol = rule.transport_protocol.value if by_name else rule.protocol_number
+    name = rule.transport_protocol.value
+    protocol = name if settings.protocol_by_name else _PROTOCOLS[name]
     if end.sends:
         return f"permit in {protocol} from {device} to {server}"
     return f"permit out {protocol} from {server} to {device}"

@@ -1,8 +1,7 @@
 """nftables on this host: the table `inet flowqos_<system>` marks the packets of verified flows.
 
-Owns: what is written into the packets of a rule, and the ruleset as an export. Packets are marked
-where they leave the host that sends them (postrouting, mangle). Only the six bits of the DSCP are
-written: ECN is the transport's (RFC 3168).
+They are marked where they leave the host that sends them (postrouting, mangle). Only the six bits
+of the DSCP are written: ECN is the transport's (RFC 3168).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from lifecycle.programming.host import (
     table_name,
 )
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
 
 _BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
@@ -35,13 +34,7 @@ _WITHOUT_PRIORITY = {"pfifo_fast": _BANDS, "prio": _BANDS, "pfifo": _BLIND, "fq_
 
 
 class NftTarget(TableTarget):
-    """The table of one system.
-
-    Args:
-        settings: None, it takes none.
-        means: their ledger says that there is a table, for who removes it later.
-        tool: runs nft.
-    """
+    """The table of one system."""
 
     kind = "nft"
 
@@ -65,7 +58,7 @@ class NftTarget(TableTarget):
             found.append((f"{network} flowlabel set {label}", f"flow label {label}"))
         if not found:
             raise ValueError("it has no DSCP and no flow label to set")
-        match, flows = flow_match(rule), named(rule)
+        match, flows = flow_match(rule), rule.named
         return [chain_line(match, statement, f"{mark}: {flows}") for statement, mark in found]
 
     def wanted(self, placed: Placed) -> Wanted:

@@ -1,9 +1,7 @@
-"""Keeps networks in step with the verified flows of one system.
+"""Keeps networks in step with the verified flows of one system: from reports to rules to targets.
 
-Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
-everything removed in the end; the address that this host sends from to a destination, as its
-routing decides; and the removal of what dead runs left. What was applied manually stays: `lifecycle
-flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+Also removes what dead runs left. What was applied manually stays: `lifecycle flows remove` or
+`lifecycle down` ends it. Blocking: a supervisor has a thread for it.
 """
 
 from __future__ import annotations
@@ -41,11 +39,7 @@ _DISCARD_PORT = 9
 
 
 def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
-    """Return what a person asked for.
-
-    Args:
-        mapping: name or file of a mapping; empty for none.
-        label_flows: see Treatment.
+    """Return what a person asked for; `mapping` is the name or the file of one, empty for none.
 
     Raises:
         UsageError: no such mapping, or its file cannot be used.
@@ -108,9 +102,6 @@ class Removal:
     """Removes everything of one run in networks, also what was applied manually.
 
     One thread removes, another cancels.
-
-    Args:
-        means: their ledger lists what is to be removed.
     """
 
     def __init__(self, means: Means) -> None:
@@ -148,11 +139,7 @@ class Programmer(Removal):
     """Programs targets with the verified flows of one system.
 
     Args:
-        plan: of the system.
-        targets: to keep in step.
-        means: what they were opened with.
         source_address: observes where publishers send from; None believes the manifest only.
-        treatment: what flows get beyond what the manifest says.
     """
 
     def __init__(

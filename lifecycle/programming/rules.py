@@ -1,10 +1,8 @@
-"""Turns verified flows into flow rules for networks, with the reason for each flow left out.
+"""Turns verified flows into flow rules for networks, with the reason for each flow left out. Pure.
 
-Owns: `FlowRule`, the step from flow reports to rules, and how a rule reads. A
-rule says only what was observed or declared: a flow whose verdict is not ok, shared memory, groups
-and tuples that two flows share in disagreement make no rule, and each is listed with its reason.
-Comments have DSCP and TOS always side by side, because products differ in which of the two they ask
-for. Pure.
+A rule says only what was observed or declared: a flow whose verdict is not ok, shared memory,
+groups and tuples that two flows share in disagreement make no rule. Comments have DSCP and TOS
+always side by side, because products differ in which of the two they ask for.
 """
 
 from __future__ import annotations
@@ -120,11 +118,6 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         """The family, which the destination decides."""
         return InternetProtocol.IPV6 if ":" in self.destination_address else InternetProtocol.IPV4
 
-    @property
-    def protocol_number(self) -> int:
-        """IANA protocol number, 6 or 17."""
-        return PROTOCOL_NUMBERS[self.transport_protocol.value]
-
     def left_out(self, reason: str) -> list[str]:
         """Return each pair that this one flow carries as one that is left out."""
         return [f"{_pair(*names)}: {reason}" for names in self.names]
@@ -134,6 +127,23 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         source = socket_text(self.source_address or "*", self.source_port)
         destination = socket_text(self.destination_address, self.destination_port)
         return f"{self.transport_protocol.value} {source} → {destination}"
+
+    @property
+    def named(self) -> str:
+        """Its flows: `/robot/video /robot/camera → /viewer`, several with commas."""
+        return ", ".join(_pair(*names) for names in self.names)
+
+    @property
+    def asks(self) -> str:
+        """What it asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
+        found = [] if self.dscp is None else [describe(self.dscp)]
+        if self.five_qi is not None:
+            found.append(f"5QI {self.five_qi}")
+        if self.flow_label:
+            found.append(f"flow label {self.flow_label:#07x}")
+        if self.max_delay_ms is not None:
+            found.append(f"at most {self.max_delay_ms:g} ms")
+        return ", ".join(found) or "nothing"
 
 
 def _address(text: str) -> IpAddress:
@@ -348,7 +358,7 @@ def _disagreement(sharing: Sequence[FlowRule]) -> Iterator[str]:
         asked = (each.dscp, each.five_qi)
         other = next(other for other in sharing if (other.dscp, other.five_qi) != asked)
         yield from each.left_out(
-            f"shares its 5-tuple with {named(other)}, which is to be treated differently; "
+            f"shares its 5-tuple with {other.named}, which is to be treated differently; "
             "make one of them unique"
         )
 
@@ -386,31 +396,12 @@ def _same_host(plan: Plan, report: FlowReport) -> bool:
     return len(places) == 1
 
 
-def named(rule: FlowRule) -> str:
-    """Return the flows of a rule: `/robot/video /robot/camera → /viewer`, several with commas."""
-    return ", ".join(_pair(*names) for names in rule.names)
-
-
-def asks(rule: FlowRule) -> str:
-    """Return what a rule asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
-    found = [] if rule.dscp is None else [describe(rule.dscp)]
-    if rule.five_qi is not None:
-        found.append(f"5QI {rule.five_qi}")
-    if rule.flow_label:
-        found.append(f"flow label {rule.flow_label:#07x}")
-    if rule.max_delay_ms is not None:
-        found.append(f"at most {rule.max_delay_ms:g} ms")
-    return ", ".join(found) or "nothing"
-
-
 def expressed(
     rules: Iterable[FlowRule], make: Callable[[FlowRule], T]
 ) -> tuple[list[tuple[FlowRule, T]], tuple[str, ...]]:
     """Return each rule with what a network makes of it, and the flows that it cannot express.
 
-    Args:
-        rules: of verified flows.
-        make: raises a ValueError with the reason where a rule cannot be expressed.
+    Where it cannot, `make` raises a ValueError with the reason.
     """
     made: list[tuple[FlowRule, T]] = []
     left_out: list[str] = []

@@ -1,9 +1,8 @@
 """A target that keeps one thing per flow and device at a server: subscriptions, sessions.
 
-Owns: what NEF and CAMARA have in common: which ends of a flow are devices of the mobile network,
-each of which is asked for; the difference between rules, ledger and server, and the order in which
-it is made up for. A request is written down before it is sent, so that what was made is found again
-even if the answer was lost. What a thing is and how it is asked for is the target's.
+What NEF and CAMARA have in common: which ends of a flow are devices of the mobile network, and the
+difference between rules, ledger and server. A request is written down before it is sent, so that
+what was made is found again even if the answer was lost.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from lifecycle.programming.http import (
     text_of,
 )
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, RuleSet, asks, expressed
+from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -41,7 +40,6 @@ from lifecycle.programming.target import (
     SettingsError,
     Target,
     TargetChanges,
-    describe_rule,
     each_done,
 )
 
@@ -99,16 +97,11 @@ def device_ends(rule: FlowRule, networks: Sequence[IpNetwork]) -> tuple[DeviceEn
 def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str:
     """Return what the operator calls the class that a flow asks for.
 
-    Args:
-        rule: of the flow.
-        names: by 5QI.
-        setting: name of `names` in the settings, for the message.
-
     Raises:
         ValueError: there is no name.
     """
     if rule.five_qi is None:
-        raise ValueError(f"it asks for no 5QI ({asks(rule)})")
+        raise ValueError(f"it asks for no 5QI ({rule.asks})")
     if rule.five_qi not in names:
         raise ValueError(
             f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
@@ -150,7 +143,6 @@ class ServerTarget(Target):
 
     Args:
         settings: path of the settings file, so that a later run can remove what this one leaves.
-        means: see Means.
 
     Attributes:
         collection: path of all things, "/sessions"; without the slash, what an export calls them.
@@ -213,7 +205,7 @@ class ServerTarget(Target):
             {
                 "key": each.key,
                 "flow": each.rule.describe(),
-                "asks": asks(each.rule),
+                "asks": each.rule.asks,
                 "body": each.body,
             }
             for each in wanted
@@ -281,18 +273,17 @@ class ServerTarget(Target):
         """Make it so, one flow after the other.
 
         Raises:
-            PartlyError: for some flows it failed; the others are done.
+            PartlyError: for some flows it failed; what was to be deleted stays in the ledger.
         """
         wanted, left_out = self._wanted(rules)
-        return replace(self._carried_out(wanted), left_out=left_out)
-
-    def remove(self) -> TargetChanges:
-        """Delete everything of ours at the server.
-
-        Raises:
-            PartlyError: some could not be deleted; they stay in the ledger.
-        """
-        return self._carried_out(())
+        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
+        done, failed = each_done(planned, self._make)
+        made = TargetChanges(target=self.name, changes=tuple(done))
+        if failed:
+            errors = [(change.key, error) for (change, _), error in failed]
+            text = [made.render(done=True)] if made.pending else []
+            raise PartlyError(self.name, len(planned), errors, done=text)
+        return replace(made, left_out=left_out)
 
     def _changes(self, wanted: Sequence[Wanted]) -> Iterator[tuple[FlowChange, Body]]:
         """Yield what is to be done, with the body that is wanted."""
@@ -304,7 +295,7 @@ class ServerTarget(Target):
                 yield FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what), {}
         for each in wanted:
             kind, detail = self._compare(entries.get(each.key), each.body)
-            what = describe_rule(each.rule)
+            what = f"{each.rule.describe()}, {each.rule.asks}"
             yield FlowChange(kind=kind, key=each.key, what=what, detail=detail), each.body
 
     def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
@@ -322,16 +313,6 @@ class ServerTarget(Target):
         if seen.differs:
             return ChangeKind.UPDATE, seen.differs
         return ChangeKind.KEEP, seen.detail
-
-    def _carried_out(self, wanted: Sequence[Wanted]) -> TargetChanges:
-        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
-        done, failed = each_done(planned, self._make)
-        made = TargetChanges(target=self.name, changes=tuple(done))
-        if failed:
-            errors = [(change.key, error) for (change, _), error in failed]
-            text = [made.render(done=True)] if made.pending else []
-            raise PartlyError(self.name, len(planned), errors, done=text)
-        return made
 
     def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
         """Make one change; return it with what came of it."""

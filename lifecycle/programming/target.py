@@ -1,8 +1,4 @@
-"""What a network target is, which there are, what it changes, and what can go wrong.
-
-Owns: `Target`, which plans, applies and removes; the names of all of them; their answers as text;
-the errors of this package. A target is imported on first use, see `names`.
-"""
+"""What a network target is, what it changes, how long it is waited for, and what can go wrong."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming import TARGETS
-from lifecycle.programming.rules import FlowRule, RuleSet, asks
+from lifecycle.programming.rules import FlowRule, RuleSet
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
@@ -85,11 +81,7 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
         return any(each.kind is not ChangeKind.KEEP for each in self.changes)
 
     def render(self, *, done: bool = False) -> str:
-        """Return the changes as text, one line per flow.
-
-        Args:
-            done: they have been made.
-        """
+        """Return the changes as text, one line per flow; `done` if they were made."""
         kinds = [each.kind for each in self.changes]
         counts = [
             f"{number} {kind.value}d" if done else f"{number} to {kind.value}"
@@ -153,11 +145,7 @@ class Patience:
 
     @contextlib.contextmanager
     def within(self, seconds: float | None) -> Iterator[None]:
-        """Bound what is done inside; an outer bound holds as well.
-
-        Args:
-            seconds: from now; None sets no bound of its own. A negative one leaves no time.
-        """
+        """Bound what is done inside, None by nothing; an outer bound holds as well."""
         outer_s = self._until_s
         if seconds is not None:
             self._until_s = min(outer_s, time.monotonic() + seconds)
@@ -171,11 +159,7 @@ class Patience:
         return 0.0 if self.cancelled.is_set() else max(0.0, self._until_s - time.monotonic())
 
     def run(self, work: Coroutine[Any, Any, T], most_s: float) -> T:
-        """Run a coroutine to its end, for as long as there is time.
-
-        Args:
-            work: cancelled once there is no time left, or whatever else ends this.
-            most_s: for it alone, seconds.
+        """Run a coroutine to its end, or cancel it after `most_s`, or once there is no time left.
 
         Raises:
             TimeoutError: there was no time left.
@@ -217,7 +201,6 @@ class Target(abc.ABC):
 
     Args:
         settings: what `read` or `restore` returned.
-        means: see Means.
 
     Attributes:
         kind: name of the target.
@@ -276,9 +259,9 @@ class Target(abc.ABC):
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, and return what was done; a second time changes nothing."""
 
-    @abc.abstractmethod
     def remove(self) -> TargetChanges:
         """Delete everything of ours."""
+        return self.apply(())
 
     def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
@@ -317,11 +300,6 @@ def read_targets(
 ) -> tuple[Chosen, ...]:
     """Return the targets that a person asked for, with their options.
 
-    Args:
-        names: of TARGETS.
-        given: values of options by name; what is missing, None or empty was not given.
-        option: what chose the targets, for messages.
-
     Raises:
         UsageError: they do not fit together.
     """
@@ -351,11 +329,6 @@ def each_done(
         except LifecycleError as error:  # noqa: PERF203 - the others go on
             failed.append((each, error))
     return done, failed
-
-
-def describe_rule(rule: FlowRule) -> str:
-    """Return a rule for people: the tuple and what it gets."""
-    return f"{rule.describe()}, {asks(rule)}"
 
 
 class ProgrammingError(LifecycleError):

@@ -42,7 +42,7 @@ from lifecycle.programming.host import (
     table_name,
 )
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, named
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError
 
 OWNED_HANDLE = "1f10:"
@@ -283,22 +283,8 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
         )
 
 
-def render_tc_removal(device: str) -> str:
-    """Return the line for `tc -batch` that removes our qdisc and all below it.
-
-    It fails, and removes nothing, if the device's root qdisc is not ours.
-    """
-    return f"qdisc del dev {device} root handle {OWNED_HANDLE}\n"
-
-
 class TcTarget(TableTarget):
-    """One device.
-
-    Args:
-        settings: of the device.
-        means: their ledger says that there is something, for who removes it later.
-        tool: runs tc and nft.
-    """
+    """One device."""
 
     kind = "tc"
     hint = "give --device eth0 --rate 20mbit"
@@ -348,7 +334,7 @@ class TcTarget(TableTarget):
             raise ValueError(
                 "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
             )
-        matches, comment = [flow_match(rule)], f"{class_.comment}: {named(rule)}"
+        matches, comment = [flow_match(rule)], f"{class_.comment}: {rule.named}"
         if self._settings.match is TcMatch.MARK:
             if rule.dscp is None:
                 raise ValueError("it has no DSCP, and rules look at nothing else here")
@@ -401,7 +387,7 @@ class TcTarget(TableTarget):
         """Delete our qdisc and our table, where they are."""
         ours = self._is_ours()
         if ours:
-            self._batch(render_tc_removal(self._device))
+            self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
         return super().clear() or ours
 
     def _root(self) -> Qdisc | None:

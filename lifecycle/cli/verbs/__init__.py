@@ -1,1 +1,1 @@
-"""One file per verb: `lifecycle NAME` is the click command named `command` in NAME.py."""
+"""The verbs: `lifecycle NAME` is `command` in NAME.py, or what VERBS says."""

@@ -1,7 +1,4 @@
-"""`lifecycle apply`: another manifest for a running system, through the gate, or back.
-
-Owns: the verb, `ApplyReport` and how it is said, and which running system a manifest is for.
-"""
+"""`lifecycle apply`: another manifest for a running system, through the gate, or back."""
 
 from __future__ import annotations
 
@@ -10,23 +7,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import click
-import msgspec
+from msgspec.structs import asdict
 
 from lifecycle.cli.common import (
     assignments_argument,
     completing,
     format_option,
+    json_of,
     load_plan,
     machine_option,
     timeout_option,
 )
-from lifecycle.codec import Count, says, to_json
+from lifecycle.codec import Count, says
 from lifecycle.errors import BringUpError, ExitCode, UsageError
-from lifecycle.printable import json_text, lines
+from lifecycle.printable import lines
+from lifecycle.supervisor.control.protocol import ChangedNodes
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.supervisor.control.protocol import Answer, ChangedNodes
+    from lifecycle.supervisor.control.protocol import Answer
 
 _SHOWN_S = 10.0
 """For a supervisor to say what would change: it only compares two plans."""
@@ -38,7 +37,7 @@ _SPARE_S = 30.0
 _OUTCOMES = ("applied", "unchanged", "would_apply", "refused", "rolled_back")
 
 
-class ApplyReport(msgspec.Struct, frozen=True, kw_only=True):
+class ApplyReport(ChangedNodes, frozen=True, kw_only=True):
     """What became of a manifest that was applied (schemas/apply.v1.schema.json).
 
     Attributes:
@@ -49,11 +48,6 @@ class ApplyReport(msgspec.Struct, frozen=True, kw_only=True):
         manifest: path of the one that was to be applied.
         revision: number of the manifest in force, 1 for the one that the run began with; 0 where it
             is not known.
-        differences: from what runs, or ran, one line each.
-        added: full names of nodes, likewise of the others; what is in none stays as it is.
-        removed: are taken down, and their processes end.
-        restarted: their processes are started again.
-        parameters: are given parameters while they run; who refuses them is started again.
         error: why it was not applied; else empty.
     """
 
@@ -62,11 +56,6 @@ class ApplyReport(msgspec.Struct, frozen=True, kw_only=True):
     system: str
     manifest: str
     revision: Count
-    differences: tuple[str, ...] = ()
-    added: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
-    restarted: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
     error: str = ""
 
 
@@ -117,24 +106,19 @@ def command(
         outcome = "applied"
         if answer.error:
             outcome = "refused" if answer.exit_code == ExitCode.USAGE else "rolled_back"
-    shown = {} if change is None else {each: getattr(change, each) for each in _SHOWN}
     report = ApplyReport(
         outcome=outcome,
         exit_code=answer.exit_code or ExitCode.OK,
         system=path.name,
         manifest=plan.manifest_path,
         error=answer.error,
-        **{"revision": 0, **shown},
+        **asdict(change or ChangedNodes(revision=0)),
     )
     if as_text:
         _say(report)
     else:
-        click.echo(json_text(to_json(report).decode()))
+        click.echo(json_of(report))
     return report.exit_code
-
-
-_SHOWN = ("revision", "differences", "added", "removed", "restarted", "parameters")
-"""What a report has from the supervisor."""
 
 
 def _run_of(plan: Plan, machine: str) -> Path:

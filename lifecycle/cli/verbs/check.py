@@ -17,6 +17,7 @@ import msgspec
 from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
 from lifecycle.cli.common import (
     format_option,
+    json_of,
     load_plan,
     machine_option,
     manifest_arguments,
@@ -32,16 +33,15 @@ from lifecycle.cli.report import (
     report_format,
     report_option,
     write_report,
-    written_or_said,
 )
-from lifecycle.codec import Count, to_json
+from lifecycle.codec import Count
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.loading import ArgumentDeclaration, declared_arguments, load
 from lifecycle.manifest.model import Manifest
 from lifecycle.plan.build import check_plan, effective_domain
 from lifecycle.plan.programs import Resolution, UnresolvedProgram
-from lifecycle.printable import count, json_text, lines
+from lifecycle.printable import count, lines
 
 TESTS = {
     "document": ("yaml.", "manifest.", "nodl."),
@@ -84,13 +84,10 @@ class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
 def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     """Return a report as "text", "json", "sarif", "junit" or "github" (text and annotations).
 
-    Args:
-        report: what was found.
-        format_: see above.
-        strict: what is unproven and what could not be resolved count as failures.
+    What is unproven or could not be resolved is a failure if it is `strict`.
     """
     if format_ == "json":
-        return to_json(report).decode()
+        return json_of(report)
     if format_ == "sarif":
         return _sarif(report).rstrip("\n")
     if format_ == "junit":
@@ -228,7 +225,7 @@ def command(
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
     # Names of files are not ours to trust.
-    shown = {"text": lines, "github": lines, "json": json_text}
+    shown = {"text": lines, "github": lines}
     click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
 
@@ -241,7 +238,7 @@ def _list(path: str, format_: str, *, others: bool) -> int:
         )
     found = declared_arguments(path)
     if format_ == "json":
-        click.echo(json_text(to_json(found).decode()))
+        click.echo(json_of(found))
     else:
         text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
         click.echo(lines(text))
@@ -258,8 +255,7 @@ def _argument(each: ArgumentDeclaration) -> str:
 
 
 def _write(report: Path, found: CheckReport, *, strict: bool) -> ExitCode:
-    text = write_check(found, report_format(report), strict=strict)
-    return written_or_said(lambda: write_report(report, text))
+    return write_report(report, write_check(found, report_format(report), strict=strict))
 
 
 def _refused(path: str, error: LifecycleError) -> CheckReport:
@@ -350,7 +346,7 @@ def verify_command(  # noqa: PLR0917 - click passes options by name
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             seen = with_supervisors_numbers(seen)
             with ending.noted():
-                unwritten = written_or_said(lambda: written.end(seen.verdict))
+                unwritten = written.end(seen.verdict)
     except Ended as ended:
         click.echo(f"ended before it was judged: {ended.reason}", err=True)
         return ended.exit_code

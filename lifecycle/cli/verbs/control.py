@@ -1,7 +1,4 @@
-"""`lifecycle status`, `down`, `pause`, `resume` and `restart`: the verbs that talk to a supervisor.
-
-Owns: how an order is given and what its outcome is as an exit code; a status as plain text.
-"""
+"""`lifecycle status`, `down`, `pause`, `resume`, `restart` and `mode`: they ask a supervisor."""
 
 from __future__ import annotations
 
@@ -17,6 +14,7 @@ from lifecycle.cli.common import (
     assignments_argument,
     completing,
     format_option,
+    json_of,
     machine_option,
     target_argument,
     target_arguments,
@@ -28,7 +26,7 @@ from lifecycle.cli.common import (
 )
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.measure.flows import measured_summary
-from lifecycle.printable import columns, count, json_text, lines, one_line
+from lifecycle.printable import columns, count, lines, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -198,7 +196,6 @@ def status_command(
     path = target_run(os.environ, target, assignments, machine)
     if watch:
         return _watch(path, format_)
-    from lifecycle.codec import to_json
 
     # takes long to import, and a wrong name needs none
     from lifecycle.supervisor.control.protocol import status
@@ -210,7 +207,7 @@ def status_command(
         ready = seen.phase in ("measuring", "active") and seen.verdict is not Outcome.VIOLATED
         return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
     if format_ == "json":
-        click.echo(json_text(to_json(seen).decode()))
+        click.echo(json_of(seen))
     else:
         click.echo(status_text(seen, width=terminal_width()))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
@@ -218,7 +215,6 @@ def status_command(
 
 def _watch(path: Path, format_: str) -> int:
     from lifecycle.cli.standard_streams import Watched
-    from lifecycle.codec import to_json
     from lifecycle.supervisor.control.server import follow
     from lifecycle.verify.outcome import Outcome
 
@@ -226,7 +222,7 @@ def _watch(path: Path, format_: str) -> int:
     with Watched(whole=not is_json) as shown, asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            shown.show(json_text(to_json(status).decode()) if is_json else _on_screen(status))
+            shown.show(json_of(status) if is_json else _on_screen(status))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 
@@ -244,9 +240,7 @@ def _list_running(format_: str) -> int:
     roots = run_roots(os.environ)
     names = [each.name for each in running(*roots)]
     if format_ == "json":
-        from lifecycle.codec import to_json
-
-        click.echo(to_json(names).decode())
+        click.echo(json_of(names))
     else:
         click.echo("\n".join(names) or "no system runs")
         for each in left_behind(*roots):

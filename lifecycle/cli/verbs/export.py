@@ -1,7 +1,4 @@
-"""`lifecycle export`: a manifest as files of another system. Needs no ROS and starts nothing.
-
-Owns: access control for SROS 2, and units or manifests of the engines that start programs.
-"""
+"""`lifecycle export`: a manifest as files of another system. Needs no ROS and starts nothing."""
 
 from __future__ import annotations
 

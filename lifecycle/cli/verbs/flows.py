@@ -1,8 +1,4 @@
-"""`lifecycle flows`: show every network flow, how unique it is and what was measured of it.
-
-Owns: flows as a table, JSON or CSV, `--record`, `--export`, and the subcommands `apply` and
-`remove`. Exported texts and what is done to networks are programming's.
-"""
+"""`lifecycle flows`: show, record and export flows; `apply` and `remove` program networks."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from lifecycle.cli.common import (
     asking,
     format_option,
     is_manifest,
+    json_of,
     load_plan,
     output_option,
     target_arguments,
@@ -21,10 +22,9 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.standard_streams import Watched
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
-    from lifecycle.export.picture.model import Picture
+    from lifecycle.export.picture import Picture
     from lifecycle.plan.model import Plan
 
 
@@ -106,9 +106,7 @@ def _found(
 def render(picture: Picture, format_: str) -> str:
     """Return a picture in one of the formats of `--format`."""
     if format_ == "json":
-        from lifecycle.codec import to_json
-
-        return json_text(to_json(picture).decode())
-    from lifecycle.export.picture import WRITERS
+        return json_of(picture)
+    from lifecycle.export.picture_writers import WRITERS
 
     return WRITERS[format_](picture)

@@ -1,7 +1,6 @@
 """`lifecycle init` and `lifecycle schema`: a package of one's own, and what editors read.
 
-Owns: the files of a new package (their texts are in cli/template/, `@NAME@` stands for its name),
-and where schemas are copied to. Needs no ROS.
+The files of a package are in cli/template/, where `@NAME@` stands for its name. Needs no ROS.
 """
 
 from __future__ import annotations

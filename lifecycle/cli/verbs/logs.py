@@ -1,7 +1,4 @@
-"""`lifecycle logs` and `lifecycle history`: what a run left on disk, its logs and its journal.
-
-Owns: which run and which files are meant; following logs, rotated ones too; and a run's timeline.
-"""
+"""`lifecycle logs` and `lifecycle history`: what a run left on disk, its logs and its journal."""
 
 from __future__ import annotations
 

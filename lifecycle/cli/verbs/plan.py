@@ -1,7 +1,4 @@
-"""`lifecycle plan` and `lifecycle ports`: what a manifest becomes, and DDS port arithmetic.
-
-Owns: the verbs and what `ports` prints; the arithmetic is `lifecycle.network`'s.
-"""
+"""`lifecycle plan` and `lifecycle ports`: what a manifest becomes, and DDS port arithmetic."""
 
 from __future__ import annotations
 
@@ -14,11 +11,11 @@ import msgspec
 
 from lifecycle.cli.common import (
     format_option,
+    json_of,
     load_plan,
     manifest_arguments,
     run_commands_option,
 )
-from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
 from lifecycle.network.ports import (
@@ -63,9 +60,9 @@ def render(plan: Plan, format_: str) -> str:
     if format_ == "text":
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
-        return to_json(without_secrets(plan)).decode()
-    from lifecycle.export.picture import WRITERS
-    from lifecycle.export.picture.build import build_picture
+        return json_of(without_secrets(plan))
+    from lifecycle.export.picture import build_picture
+    from lifecycle.export.picture_writers import WRITERS
 
     return WRITERS[format_](build_picture(plan))
 
@@ -120,7 +117,7 @@ def ports_command(*, domain: int | None, participant: int, format_: str) -> int:
         )
     except ValueError as error:
         raise UsageError(str(error)) from error
-    click.echo(to_json(report).decode() if format_ == "json" else "\n".join(_lines(report)))
+    click.echo(json_of(report) if format_ == "json" else "\n".join(_lines(report)))
     return ExitCode.OK
 
 

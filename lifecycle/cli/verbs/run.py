@@ -1,6 +1,6 @@
 """`lifecycle run MANIFEST NODE`: one node of a manifest in this terminal, without a supervisor.
 
-Owns: finding the node in the plan; a node that is not a Python class replaces this process.
+A node that is not a Python class replaces this process.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import completing, load_manifest
+from lifecycle.cli.common import completing, load_plan
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
-from lifecycle.plan.build import build_plan, find_node
+from lifecycle.plan.build import find_node
 from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan, PlannedNode
 
@@ -46,7 +46,7 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     NODE is a key under `nodes:` or a fully qualified name. What follows --ros-args goes to ROS.
     """
     split = words.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in words else len(words)
-    plan = build_plan(load_manifest(manifest, words[:split]).manifest)
+    plan = load_plan(manifest, words[:split])
     planned = find_node(plan, node)
     environment = {"ROS_DOMAIN_ID": str(plan.domain_id)}
     if plan.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:

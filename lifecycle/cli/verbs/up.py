@@ -9,14 +9,14 @@ import click
 from lifecycle.cli.common import (
     completing,
     format_option,
-    load_manifest,
+    load_plan,
     machine_option,
     manifest_arguments,
     network_options,
     read_networks,
     timeout_option,
 )
-from lifecycle.cli.report import ReportFile, report_option, written_or_said
+from lifecycle.cli.report import ReportFile, report_option
 from lifecycle.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -123,11 +123,10 @@ def command(
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
-                from lifecycle.plan.build import build_plan, started_by_others
-
-                loaded = load_manifest(manifest, assignments, machine=machine)
-                plan = build_plan(loaded.manifest, domain_id=domain)
+                plan = load_plan(manifest, assignments, machine=machine, domain_id=domain)
                 if without:
+                    from lifecycle.plan.build import started_by_others
+
                     plan = started_by_others(plan, without)
                 written.begin(plan)
                 from lifecycle.cli.up_output import output
@@ -183,6 +182,6 @@ def _fork_server(program: tuple[Chosen, ...]) -> ForkServerProcess:
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:
     """Write and show how a run ended; return its exit code, no success without its report."""
-    unwritten = written_or_said(lambda: written.end(result.verdict, result.plan))
+    unwritten = written.end(result.verdict, result.plan)
     listener.finish(result)
     return result.exit_code or unwritten

@@ -22,8 +22,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError, UsageError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
-from lifecycle.export.picture.build import Supervised, build_picture
-from lifecycle.export.picture.model import Picture
+from lifecycle.export.picture import Picture, Supervised, build_picture
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import check_memory

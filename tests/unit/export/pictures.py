@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from lifecycle.export.picture.build import Supervised, build_picture
-from lifecycle.export.picture.model import Picture
+from lifecycle.export.picture import Picture, Supervised, build_picture
 from lifecycle.manifest.model import Discovery, EndpointKind, Machine, UniqueHow
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement

@@ -20,15 +20,21 @@ from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.export.picture import (
+    STATES,
+    Picture,
+    PicturedNodeState,
+    Presence,
+    Supervised,
+    build_picture,
+)
+from lifecycle.export.picture_writers import (
+    OUTCOMES,
     WRITERS,
     picture_to_html,
     picture_to_mermaid,
     picture_to_svg,
     picture_to_text,
 )
-from lifecycle.export.picture.build import Supervised, build_picture
-from lifecycle.export.picture.model import STATES, Picture, PicturedNodeState, Presence
-from lifecycle.export.picture.text import OUTCOMES
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.build import build_plan
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan.model import PlannedNode
-from lifecycle.programming.rules import FlowRule, Treatment, asks, flow_rules, named
+from lifecycle.programming.rules import FlowRule, Treatment, flow_rules
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 from tests.builders import nfe
@@ -219,6 +219,6 @@ def test_a_rule_that_no_filter_could_say_is_refused(
 
 
 def test_a_rule_in_words_says_dscp_and_tos_side_by_side() -> None:
-    assert named(VIDEO) == "/video /robot/camera → /viewer"
-    assert asks(VIDEO) == "EF = DSCP 46 = TOS 184 (0xb8), 5QI 85, at most 5 ms"
-    assert asks(rule("/x", "*:1", "10.0.0.1:2")) == "nothing"
+    assert VIDEO.named == "/video /robot/camera → /viewer"
+    assert VIDEO.asks == "EF = DSCP 46 = TOS 184 (0xb8), 5QI 85, at most 5 ms"
+    assert rule("/x", "*:1", "10.0.0.1:2").asks == "nothing"
