@@ -133,6 +133,7 @@ def lay_out(
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
         measured=observation.measured,
+        active_s=dict(observation.active_s),
         clocks=None if observation.clocks is None else dict(observation.clocks),
         marks={(each.machine, each.dscp): each.arrives_as for each in observation.marks},
     )
