@@ -81,32 +81,32 @@ class TopicMeasurements:
             machines: None for all.
         """
         nodes = {each.key: each for each in plan.nodes}
-        asked, left_out = {}, set()
+        asked: dict[str, tuple[str, QosProfile]] = {}
+        left_out, apart = set[str](), set[str]()
         for flow in plan.flows:
-            if not flow.measure or flow.topic in asked:
-                continue
             publisher, subscriber = nodes.get(flow.publisher), nodes.get(flow.subscription)
             if publisher is None or subscriber is None:
                 left_out.add(flow.topic)
                 continue
-            if machines is not None and subscriber.machine not in machines:
+            if publisher.machine != subscriber.machine:
+                apart.add(flow.topic)
+            if not flow.measure or (machines is not None and subscriber.machine not in machines):
                 continue  # its own supervisor does
             for end in subscriber.endpoints:
                 is_its = end.kind is EndpointKind.SUBSCRIPTION and end.resolved == flow.topic
                 if is_its and end.qos is not None:
                     qos = replace(end.qos, durability=Durability.VOLATILE, depth=_DEPTH)
-                    is_apart = publisher.machine != subscriber.machine
-                    asked[flow.topic] = (end.type, qos, is_apart)
+                    asked.setdefault(flow.topic, (end.type, qos))
         for topic, each in tuple(self._topics.items()):
-            as_now = asked.get(topic) == (each.type, each.qos, each.is_apart)
-            if not as_now and (topic in asked or topic not in left_out):
+            as_now = (each.type, each.qos) == asked.get(topic) and each.is_apart == (topic in apart)
+            if not as_now and topic not in left_out:
                 self._clients.no_messages(topic)
                 del self._topics[topic]
-        for topic, (type_, qos, is_apart) in asked.items():
+        for topic, (type_, qos) in asked.items():
             if topic not in self._topics:
-                since_ns = time.monotonic_ns()
-                of = _Listening(type=type_, qos=qos, is_apart=is_apart, since_ns=since_ns)
-                self._topics[topic] = of
+                self._topics[topic] = of = _Listening(
+                    type=type_, qos=qos, is_apart=topic in apart, since_ns=time.monotonic_ns()
+                )
                 try:
                     self._clients.on_messages(topic, type_, qos, of.arrived)
                 except MiddlewareError as error:
