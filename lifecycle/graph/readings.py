@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
@@ -308,55 +309,94 @@ class DiagnosticReadings:
 _DEPTH = 1000
 """So many messages may come while this process does something else."""
 
+_DISCOVERED_S = 3.5
+"""A publisher that was there before is discovered within this time: until then its silence is none
+of its own."""
+
+
+class _Listening(msgspec.Struct):
+    """A subscription of ours.
+
+    Attributes:
+        type: of the topic.
+        qos: as it was asked for.
+        since_ns: on the monotonic clock.
+        counter: from its first message on.
+    """
+
+    type: str
+    qos: QosProfile
+    is_apart: bool
+    since_ns: int
+    counter: Counter | None = None
+
+    def arrived(self, _: bytes, info: Mapping[str, int]) -> None:
+        """Count a message."""
+        now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+        if self.counter is None:
+            self.counter = Counter(now_ns, wall_ns, is_apart=self.is_apart)
+        self.counter.arrived(now_ns, wall_ns, info)
+
+    def sample(self, now_ns: int) -> Sample:
+        """Return what was counted."""
+        if self.counter is not None:
+            return self.counter.sample(now_ns)
+        seconds = (now_ns - self.since_ns) / 1e9
+        return Sample(seconds=seconds, silent_s=max(0.0, seconds - _DISCOVERED_S))
+
 
 class TopicMeasurements:
     """Counts what arrives on some topics, from their first message on."""
 
     def __init__(self, clients: NodeClients) -> None:
         self._clients = clients
-        self._since_ns: dict[str, int] = {}
-        self._counters: dict[str, Counter] = {}
+        self._topics: dict[str, _Listening] = {}
 
     def listen(self, plan: Plan, machines: Collection[str] | None) -> None:
-        """Measure what a plan asks for at subscriptions on these machines; None for all.
+        """Measure what a plan asks for at subscriptions on these machines, and nothing else.
 
         The same again changes nothing.
+
+        Args:
+            plan: whose flows are measured; those of nodes that it leaves out stay as they are.
+            machines: None for all.
         """
+        nodes = {each.key: each for each in plan.nodes}
+        asked: dict[str, tuple[str, QosProfile]] = {}
+        left_out, apart = set[str](), set[str]()
         for flow in plan.flows:
-            if not flow.measure or flow.topic in self._since_ns:
+            publisher, subscriber = nodes.get(flow.publisher), nodes.get(flow.subscription)
+            if publisher is None or subscriber is None:
+                left_out.add(flow.topic)
                 continue
-            if machines is not None and plan.node(flow.subscription).machine not in machines:
+            if publisher.machine != subscriber.machine:
+                apart.add(flow.topic)
+            if not flow.measure or (machines is not None and subscriber.machine not in machines):
                 continue  # its own supervisor does
-            self._since_ns[flow.topic] = time.monotonic_ns()
-            for end in plan.node(flow.subscription).endpoints:
+            for end in subscriber.endpoints:
                 is_its = end.kind is EndpointKind.SUBSCRIPTION and end.resolved == flow.topic
                 if is_its and end.qos is not None:
                     qos = replace(end.qos, durability=Durability.VOLATILE, depth=_DEPTH)
-                    machines = {
-                        plan.node(key).machine for key in (flow.publisher, flow.subscription)
-                    }
-                    self._subscribe(flow.topic, end.type, qos, is_apart=len(machines) > 1)
-
-    def _subscribe(self, topic: str, type_: str, qos: QosProfile, *, is_apart: bool) -> None:
-        def arrived(_: bytes, info: Mapping[str, int]) -> None:
-            now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-            if topic not in self._counters:
-                self._counters[topic] = Counter(now_ns, wall_ns, is_apart=is_apart)
-            self._counters[topic].arrived(now_ns, wall_ns, info)
-
-        try:
-            self._clients.on_messages(topic, type_, qos, arrived)
-        except MiddlewareError as error:
-            _logger.warning("cannot measure %s: %s", topic, error)
+                    asked.setdefault(flow.topic, (end.type, qos))
+        for topic, each in tuple(self._topics.items()):
+            as_now = (each.type, each.qos) == asked.get(topic) and each.is_apart == (topic in apart)
+            if not as_now and topic not in left_out:
+                self._clients.no_messages(topic)
+                del self._topics[topic]
+        for topic, (type_, qos) in asked.items():
+            if topic not in self._topics:
+                self._topics[topic] = of = _Listening(
+                    type=type_, qos=qos, is_apart=topic in apart, since_ns=time.monotonic_ns()
+                )
+                try:
+                    self._clients.on_messages(topic, type_, qos, of.arrived)
+                except MiddlewareError as error:
+                    _logger.warning("cannot measure %s: %s", topic, error)
 
     def measured(self) -> Measured | None:
         """Return what was counted until now; None where nothing is measured so."""
-        if not self._since_ns:
+        if not self._topics:
             return None
         now_ns = time.monotonic_ns()
-        samples = []
-        for topic, since_ns in self._since_ns.items():
-            counter, seconds = self._counters.get(topic), (now_ns - since_ns) / 1e9
-            empty = Sample(seconds=seconds, silent_s=0.0)
-            samples.append((topic, empty if counter is None else counter.sample(now_ns)))
+        samples = ((topic, each.sample(now_ns)) for topic, each in self._topics.items())
         return Measured(active_s=0.0, samples=tuple(samples))

@@ -61,6 +61,7 @@ class NodeGate:
         self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Callable[[], None]] = {}
+        self._left: dict[str, Counter] = {}  # of subscriptions that are gone, by topic
         self._opened_ns = 0
 
     def add(self, entity: object, gated: Gated) -> None:
@@ -74,7 +75,9 @@ class NodeGate:
 
     def remove(self, entity: object) -> None:
         """Forget an entity that is being destroyed."""
-        self._entities.pop(id(entity), None)
+        gone = self._entities.pop(id(entity), None)
+        if isinstance(gone, GatedSubscription) and gone.counter is not None:
+            self._left[gone.topic] = gone.counter
         if (stop := self._workers.pop(id(entity), None)) is not None:
             stop()
 
@@ -106,9 +109,18 @@ class NodeGate:
         for gated in tuple(self._entities.values()):
             gated.open()
 
+    def counter(self, topic: str) -> Counter:
+        """Return what is to count a topic: of a subscription made anew, what counted before."""
+        is_apart = topic in self.apart
+        counter = self._left.pop(topic, None)
+        if counter is None or counter.is_apart is not is_apart:
+            counter = Counter(time.monotonic_ns(), time.time_ns(), is_apart=is_apart)
+        return counter
+
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
         self.is_open = False
+        self._left.clear()
         for stop in tuple(self._workers.values()):
             stop()
         for gated in tuple(self._entities.values()):
@@ -188,6 +200,10 @@ class GatedSubscription:
         later: of its node; None for one whose executor the gate holds: then messages are left
             alone while it is closed.
 
+    Attributes:
+        topic: fully qualified.
+        counter: None while closed.
+
     Raises:
         LifecycleError: its callback takes message info, and its node's gate counts nothing.
     """
@@ -196,7 +212,7 @@ class GatedSubscription:
         self, subscription: Subscription, gate: NodeGate, later: Later | None = None
     ) -> None:
         self._subscription = subscription
-        self._topic = str(subscription.topic_name)
+        self.topic = str(subscription.topic_name)
         self._gate = gate
         self._later = later
         qos = subscription.qos_profile
@@ -205,11 +221,11 @@ class GatedSubscription:
             maxlen=qos.depth or None
         )
         self._call = subscription.callback
-        self._counter: Counter | None = None
+        self.counter: Counter | None = None
         takes_one = _takes_one(self._call)
         if not gate.counts and not takes_one:
             raise LifecycleError(
-                f"cannot give the callback of {self._topic!r} message info with 'executor: events'",
+                f"cannot give the callback of {self.topic!r} message info with 'executor: events'",
                 hint="have it take the message alone, or choose another executor",
             )
         if gate.counts and takes_one:
@@ -217,27 +233,26 @@ class GatedSubscription:
 
     def open(self) -> None:
         """Give messages to the user's callback, those first that were kept."""
-        is_apart = self._topic in self._gate.apart
+        is_apart = self.topic in self._gate.apart
         if not self._gate.counts:
             self._subscription.callback = self._call
-        elif self._counter is None or self._counter.is_apart is not is_apart:
-            now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-            self._counter = Counter(now_ns, wall_ns, is_apart=is_apart)
-            self._subscription.callback = counting(self._call, self._counter)
+        elif self.counter is None or self.counter.is_apart is not is_apart:
+            self.counter = self._gate.counter(self.topic)
+            self._subscription.callback = counting(self._call, self.counter)
         if self._kept and self._later is not None:
             self._later(self._deliver)
 
     def close(self) -> None:
         """Count no more, and drop messages."""
-        self._counter = None
+        self.counter = None
         self._subscription.callback = self._call
         if self._later is not None:
             self._subscription.callback = self._drop if self._gate.counts else self._keep
 
     def sample(self, now_ns: int) -> tuple[str, Sample] | None:
         """Return the topic and what was counted; None if nothing is."""
-        counter = self._counter
-        return None if counter is None else (self._topic, counter.sample(now_ns))
+        counter = self.counter
+        return None if counter is None else (self.topic, counter.sample(now_ns))
 
     def _drop(self, message: object, info: Info) -> None:
         self._keep(message, info)

@@ -124,6 +124,7 @@ def lay_out(
             reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
         ),
         measured=observation.measured,
+        active_s=dict(observation.active_s),
         clocks=None if observation.clocks is None else dict(observation.clocks),
         marks={(each.machine, each.dscp): each.arrives_as for each in observation.marks},
     )

@@ -222,6 +222,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
         measured: what subscriptions of the observer have counted; None where it has none.
+        active_s: for how long nodes are seen to be active that do not report it, by full name.
         clocks: of the hosts of other machines, by the machine's name, as far as they are known;
             None where that is not the question yet.
         marks: with what DSCP arrives what supervisors of other machines send, by the machine's name
@@ -251,6 +252,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
     measured: Measured | None
+    active_s: Mapping[str, float]
     clocks: Mapping[str, ClockOffset] | None
     marks: Mapping[tuple[str, int], int | None]
 

@@ -89,7 +89,7 @@ class NodeClients:
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
         self._calls = ServiceCalls(observer)
-        self._subscriptions: dict[str, Subscription] = {}  # by topic
+        self._subscriptions: dict[tuple[str, bool], Subscription] = {}  # by topic, and raw
         self._diagnostics_timer: Timer | None = None
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
@@ -448,6 +448,10 @@ class NodeClients:
         """Have `callback` called with each message of a topic, serialized, and its message info."""
         self._subscribe(import_interface(type_), topic, callback, to_rclpy(qos), raw=True)
 
+    def no_messages(self, topic: str) -> None:
+        """Have `on_messages` of a topic call back no more."""
+        self._unsubscribe(topic, raw=True)
+
     def forget(self, node: str) -> None:
         """Drop the clients and the subscription of a node that left the graph."""
         self._calls.forget(f"{node}/")
@@ -459,8 +463,8 @@ class NodeClients:
         if self._diagnostics_timer is not None:
             self._observer.node.destroy_timer(self._diagnostics_timer)
             self._diagnostics_timer = None
-        for topic in tuple(self._subscriptions):
-            self._unsubscribe(topic)
+        for topic, raw in tuple(self._subscriptions):
+            self._unsubscribe(topic, raw=raw)
 
     def _subscribe(
         self,
@@ -471,14 +475,14 @@ class NodeClients:
         *,
         raw: bool = False,
     ) -> None:
-        if topic not in self._subscriptions:
-            self._subscriptions[topic] = self._observer.node.create_subscription(
+        if (topic, raw) not in self._subscriptions:
+            self._subscriptions[topic, raw] = self._observer.node.create_subscription(
                 type_, topic, callback, qos, callback_group=self._calls.group, raw=raw
             )
 
-    def _unsubscribe(self, topic: str) -> None:
-        if topic in self._subscriptions:
-            self._observer.node.destroy_subscription(self._subscriptions.pop(topic))
+    def _unsubscribe(self, topic: str, *, raw: bool = False) -> None:
+        if (topic, raw) in self._subscriptions:
+            self._observer.node.destroy_subscription(self._subscriptions.pop((topic, raw)))
 
 
 async def _reply(

@@ -461,7 +461,8 @@ def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
     if run.options.until is Until.CONNECTED or verdict is None:
         return ExitCode.OK, ""
     left = follows_from_shut_down(run, verdict)
-    held = phase_of(run) == "held" and run.options.until is Until.ACTIVE
+    withheld = any(each.withheld for each in run.nodes.values())
+    held = (withheld or phase_of(run) == "held") and run.options.until is Until.ACTIVE
     closed = gate.closes(verdict, strict=run.options.strict) and not left
     down = ", ".join(each.name for each in run.processes.values() if each.failed)
     found = (

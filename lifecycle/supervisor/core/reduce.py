@@ -85,6 +85,7 @@ def _settle(run: Run) -> list[Event]:
         events += _hold(run)
     if passage is not None and run.passage is None and was_held:
         run.changed()  # a look that began on the way through the gate measures nothing
+        run.probation = run.mark
     return [*events, *_returned(run)]
 
 

@@ -190,7 +190,9 @@ def follow_running(
 def _apart_from_numbers(seen: JudgedSystem) -> JudgedSystem:
     """Return what was seen without what is another number each time it is measured."""
     configurations = (replace(each, measured=None) for each in seen.observation.configurations)
-    observation = replace(seen.observation, configurations=tuple(configurations))
+    observation = replace(
+        seen.observation, configurations=tuple(configurations), measured=None, active_s=()
+    )
     return replace(seen, observation=observation, verdict=apart_from_numbers(seen.verdict))
 
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
-from lifecycle.measure.sample import SLOT_S, Measured
+from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections import discovery_server
@@ -35,6 +35,7 @@ from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.matching import UNKNOWN_PEER
 from lifecycle.verify.rules.measured import decided_by_clocks
 from lifecycle.verify.rules.state import UNHEALTHY, health_of
+from lifecycle.verify.tool_filter import PREFIX_DIGITS
 from lifecycle.verify.verdict import FindingKey, Stage, Verdict
 
 if TYPE_CHECKING:
@@ -105,8 +106,9 @@ class Looks:
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
         self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
-        self._active_far: dict[str, float] = {}  # nodes of other machines, and since when
-        self._passing_s = NEVER_S  # until one of them may not pass any more
+        # Nodes that are not our hosts' and their participants' prefixes, and since when.
+        self._active: dict[tuple[str, str], float] = {}
+        self._passing_s = NEVER_S  # until one of what is found may not pass any more
 
     @property
     def is_behind(self) -> bool:
@@ -224,7 +226,7 @@ class Looks:
             observation = replace(
                 observation, clocks=self._shell.peers.clocks(), marks=self._shell.peers.marks()
             )
-        observation = self._with_far_activity(observation)
+        observation = self._with_activity(observation)
         self.seen = observation
         system.present = arrivals(system.present or (), observation, system.emit)
         if self._shell.authority is not None:
@@ -261,19 +263,24 @@ class Looks:
         more = (*self._shell.peers.findings(observation), *discovery_server.findings(system))
         return with_findings(verdict, more, expected.policy)
 
-    def _with_far_activity(self, observation: Observation) -> Observation:
-        """Return what was seen, with how long nodes of other machines are seen to be active."""
-        far = {each.full_name for each in self._system.remote.values()}
-        seen, now_s = observation.configurations, asyncio.get_running_loop().time()
-        active = [each.name for each in seen if each.name in far and each.state in ("", ACTIVE)]
-        self._active_far = {name: self._active_far.get(name, now_s) for name in active}
-        timed = (
-            replace(each, measured=Measured(active_s=now_s - self._active_far[each.name]))
-            if each.name in self._active_far
-            else each
-            for each in seen
-        )
-        return replace(observation, configurations=tuple(timed)) if active else observation
+    def _with_activity(self, observation: Observation) -> Observation:
+        """Return what was seen, with how long nodes are seen to be active that are not our hosts'.
+
+        A process that replaced another, which has a participant of its own, is seen anew.
+        """
+        ours = {each.name for each in self._system.nodes.values() if each.is_hosted}
+        states = {each.full_name: each.state for each in observation.nodes}
+        states |= {each.name: each.state for each in observation.configurations}
+        prefixes = {each.node: each.gid[:PREFIX_DIGITS] for each in observation.endpoints}
+        now_s = asyncio.get_running_loop().time()
+        active = [
+            (name, prefixes.get(name, ""))
+            for name in (each.full_name for each in self._system.plan.nodes)
+            if name not in ours and states.get(name, "absent") in (None, "", ACTIVE)
+        ]
+        self._active = {each: self._active.get(each, now_s) for each in active}
+        times = tuple((name, now_s - since_s) for (name, _), since_s in self._active.items())
+        return replace(observation, active_s=times)
 
     def _plan_asked(self) -> Plan:
         """Return the plan without silent nodes; the same object while that is the same."""

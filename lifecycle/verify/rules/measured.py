@@ -152,6 +152,8 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         sample: what its subscription has counted; None where it is judged by another supervisor or
             cannot count.
         several: how many publishers its subscription has.
+        publish_s: for how long those that are active have been let publish, seconds; empty where
+            that is not known of one.
         has_clocks: both ends are on one host, or a supervisor on each compares its clock.
         clock: what is known of the clocks of all who publish to the subscription; None if one is
             not known.
@@ -162,10 +164,19 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     flow: FlowView
     sample: Sample | None
     several: int
+    publish_s: tuple[float, ...]
     has_clocks: bool
     clock: ClockOffset | None
     own: tuple[Quantity, ...]
     of_topic: tuple[Quantity, ...]
+
+    @property
+    def awaited_s(self) -> float:
+        """So long what is declared of it lets it be without a message, at least PROBATION_S."""
+        bounds = [bound for each in (*self.own, *self.of_topic) for bound in bounds_of(each)]
+        silences = (each.most for each in bounds if each.kind is Kind.SILENCE and each.most)
+        periods = (1 / each.least for each in bounds if each.kind is Kind.RATE and each.least)
+        return max([PROBATION_S, *silences, *periods])
 
     @property
     def where(self) -> str:
@@ -220,9 +231,6 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """Judge each of its numbers that can be measured, the same one only once."""
         if self.sample is None:
             return
-        report = self.flow.nodes[0].configuration
-        measured = None if report is None else report.measured
-        publishes_s = None if measured is None else measured.active_s
         seen: set[Bound] = set()
         for quantity in (*self.own, *self.of_topic):
             if self.why_not(quantity):
@@ -230,6 +238,9 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             for bound in bounds_of(quantity):
                 if bound not in seen:
                     seen.add(bound)
+                    # All of them make the rate of a topic; one is enough for it not to be silent.
+                    which = max if bound.kind is Kind.SILENCE else min
+                    publishes_s = which(self.publish_s, default=None)
                     judged = judge(bound, self.sample, publishes_s=publishes_s, clock=self.clock)
                     yield quantity, bound, judged
 
@@ -358,7 +369,7 @@ def _judged(view: View, each: _Counted) -> Iterator[Finding]:
         elif _is_given_up(judgement) and view.clocks is not None:
             why = _too_uncertain(quantity, bound, judgement, each)
             yield each.not_measured(quantity, why, observed=judgement.observed)
-        elif judgement.kept is None and not sample.messages and sample.seconds > PROBATION_S:
+        elif judgement.kept is None and not sample.messages and sample.seconds > each.awaited_s:
             why = f"nothing has arrived for {sample.silent_s:.0f} s"
             yield each.not_measured(quantity, why, rule=NOTHING_ARRIVED, observed="no message")
 
@@ -401,22 +412,35 @@ def _counted(view: View) -> list[_Counted]:
         of_topic = (each for one in flows[0].subscriptions for each in one.planned.quantities)
         numbers = tuple(of_topic)
         sample = _sample(view, flows[0])
-        for flow in flows:
-            if is_missing(flow):
-                continue
+        there = [each for each in flows if not is_missing(each)]
+        active = [each for each in there if _is_active(view, each)]
+        times = [_publishes_s(view, each.nodes[0]) for each in active]
+        publish_s = tuple(each for each in times if each is not None)
+        judging = (active or there or flows)[0]
+        for flow in there:
             published = (each for one in flow.publishers for each in one.planned.quantities)
             counted = _Counted(
                 flow=flow,
                 sample=sample,
                 several=max(planned, publishers[topic]),
+                publish_s=() if None in times else publish_s,
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
                 own=(*flow.planned.quantities, *published),
-                of_topic=numbers,
+                of_topic=numbers if flow is judging else (),  # once, for all publishers
             )
             found.append(counted)
-            numbers = ()  # they are judged once, for all publishers
     return found
+
+
+def _publishes_s(view: View, node: NodeFacts) -> float | None:
+    """Return for how long a node has been let publish; None if that is not known."""
+    if node.name in view.active_s:
+        return view.active_s[node.name]
+    report = None if node.configuration is None else node.configuration.measured
+    if report is None:
+        return 0.0 if node.is_ours else None  # one of ours says so within a moment
+    return report.active_s
 
 
 def _too_uncertain(quantity: Quantity, bound: Bound, judgement: Judgement, of: _Counted) -> str:
@@ -490,6 +514,13 @@ def _is_active(view: View, flow: FlowView) -> bool:
     return view.stage is Stage.ACTIVE and all(
         not facts.absent
         and (not facts.node.managed or facts.node.state is TargetState.ACTIVE)
-        and (facts.configuration is None or facts.configuration.state in ("", "active"))
+        and _state_of(facts) in ("", "active")
         for facts in flow.nodes
     )
+
+
+def _state_of(facts: NodeFacts) -> str:
+    """Return the state of a node; empty if it has none, or it is not known."""
+    if facts.configuration is not None:
+        return facts.configuration.state
+    return (facts.observed.state if facts.observed is not None else None) or ""

@@ -66,13 +66,18 @@ class Informed(LifecycleNode):
         pass
 
 
+def qos() -> QoSProfile:
+    """Of plain nodes, RELIABLE or not as their environment says."""
+    reliability = ReliabilityPolicy[os.environ.get("RELIABILITY", "BEST_EFFORT")]
+    return QoSProfile(depth=5, reliability=reliability)
+
+
 class PlainSink(rclpy.node.Node):
     """Likewise, a node that knows nothing of a lifecycle."""
 
     def __init__(self) -> None:
         super().__init__("sink")
-        qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(UInt64, "numbers", self._take, qos)
+        self.create_subscription(UInt64, "numbers", self._take, qos())
         self.create_timer(EVERY_S, block)
 
     def _take(self, message: UInt64) -> None:
@@ -80,7 +85,16 @@ class PlainSink(rclpy.node.Node):
             time.sleep(0.05)
 
 
-def main() -> None:
-    """Run a plain sink as a program of its own."""
+class PlainSource(rclpy.node.Node):
+    """Publishes numbers at HERTZ."""
+
+    def __init__(self) -> None:
+        super().__init__("source")
+        self._publisher = self.create_publisher(UInt64, "numbers", qos())
+        self.create_timer(1 / HERTZ, lambda: self._publisher.publish(UInt64()))
+
+
+def main(kind: str = "PlainSink") -> None:
+    """Run a plain node as a program of its own."""
     rclpy.init()
-    rclpy.spin(PlainSink())
+    rclpy.spin(globals()[kind]())

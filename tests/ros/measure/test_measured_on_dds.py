@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -57,6 +60,12 @@ def bounds_of(verdict: Mapping[str, Any]) -> dict[str, str]:
 
 
 PLAIN = {"run": {"python": f"{NODES}:PlainSink"}, "managed": False}
+
+
+def program(kind: str, **environment: str) -> dict[str, Any]:
+    code = f"from tests.ros.measure import nodes; nodes.main({kind!r})"
+    run = {"command": [sys.executable, "-c", code], "environment": environment}
+    return {"run": run, "managed": False}
 
 
 @pytest.mark.parametrize("sink", ["ours", "plain"])
@@ -160,6 +169,47 @@ def test_data_are_measured_anew_after_each_order_and_what_was_before_is_no_fault
         run.until_found("flow.rate", SUBJECT)
 
 
+def test_a_source_of_others_is_measured_anew_when_it_is_started_again_or_has_another_qos(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    def changed(reliability: str) -> Path:
+        qos = {"reliability": reliability}
+        numbers = [{"name": "numbers", "type": "std_msgs/msg/UInt64", "qos": qos}]
+        source = program("PlainSource", RELIABILITY=reliability)
+        sink = program("PlainSink", RELIABILITY=reliability, FAULT=str(tmp_path / "fault"))
+        bounds = {"rate_hz": 60, "max_silence_s": 1, "measure": True}
+        nodes = {
+            "source": {**source, "restart": "on-failure", "interface": {"publishers": numbers}},
+            "sink": {
+                **sink,
+                "interface": {"subscriptions": numbers},
+                "flows": {"subscriptions": {"numbers": bounds}},
+            },
+        }
+        return write(tmp_path, fresh_domain, nodes, policy={"trust": ["flow.unreported"]})
+
+    (tmp_path / "fault").write_text("")
+    with up(changed("RELIABLE"), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.until_verdict(lambda verdict: set(bounds_of(verdict).values()) == {"ok"})
+        since = len(run.of_kind("verdict"))
+        assert verb("restart", "system", "source", runtime=tmp_path).returncode == ExitCode.OK
+        time.sleep(4.0)
+        run.catch_up()
+        os.kill(run.pid_of("source"), signal.SIGKILL)
+        run.until("restarted", process="source")
+        time.sleep(4.0)
+        applied = verb("apply", str(changed("BEST_EFFORT")), runtime=tmp_path)
+        assert applied.returncode == ExitCode.OK, applied.stderr
+        time.sleep(4.0)
+        run.catch_up()
+        for verdict in (each["verdict"] for each in run.of_kind("verdict")[since:]):
+            named = {each["rule"] for each in verdict["findings"]}
+            assert named.isdisjoint({"flow.rate", "flow.silent"})
+        status = verb("status", "system", "--format", "json", runtime=tmp_path)
+        assert set(bounds_of(json.loads(status.stdout)).values()) == {"ok"}, status.stdout
+
+
 def test_verify_measures_what_runs_already(tmp_path: Path, fresh_domain: int) -> None:
     manifest, fault = system(tmp_path, fresh_domain)
     with up(manifest, runtime=tmp_path) as run:
@@ -177,14 +227,7 @@ def test_verify_measures_what_runs_already(tmp_path: Path, fresh_domain: int) ->
 def test_what_a_node_of_others_takes_is_unverifiable_and_strict_refuses_it(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    program = "from tests.ros.measure import nodes; nodes.main()"
-    own = {
-        "run": {
-            "command": [sys.executable, "-c", program],
-            "environment": {"FAULT": str(tmp_path / "fault")},
-        },
-        "managed": False,
-    }
+    own = program("PlainSink", FAULT=str(tmp_path / "fault"))
     manifest, fault = system(tmp_path, fresh_domain, sink=own)
     with up(manifest, "--strict", runtime=tmp_path) as run:
         assert run.finish() == ExitCode.UNVERIFIABLE

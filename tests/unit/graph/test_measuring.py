@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.graph.readings import TopicMeasurements
 from lifecycle.manifest.model import Machine, Run, RunKind
+from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.plan.model import Plan
 from tests.builders import at, link, node, planned, publisher, subscription
 
@@ -23,11 +25,14 @@ class Clients:
     def on_messages(self, topic: str, *_: object) -> None:
         self.topics.append(topic)
 
+    def no_messages(self, topic: str) -> None:
+        self.topics.remove(topic)
 
-def plan(*, measure: bool) -> Plan:
+
+def plan(*, measure: bool, **qos: object) -> Plan:
     return planned(
-        node("one", publisher("a"), machine="near"),
-        node("two", subscription("a"), run=FOREIGN, machine="far"),
+        node("one", publisher("a", **qos), machine="near"),
+        node("two", subscription("a", **qos), run=FOREIGN, machine="far"),
         links=[link("/a", "one", "two", measure=measure)],
         machines=tuple(Machine(name=each, at=at(2)) for each in ("near", "far")),
     )
@@ -51,3 +56,38 @@ def test_a_topic_is_subscribed_to_once_where_its_subscriber_is_and_the_manifest_
         measurements.listen(plan(measure=measure), machines)
     assert clients.topics == topics
     assert (measurements.measured() is not None) == bool(topics)
+
+
+def test_what_another_plan_asks_for_otherwise_is_subscribed_to_anew() -> None:
+    clients = Clients()
+    measurements = TopicMeasurements(clients)  # type: ignore[arg-type]
+    measurements.listen(plan(measure=True), None)
+    before = measurements._topics["/a"]
+    other = QosProfile(reliability=Reliability.BEST_EFFORT)
+    measurements.listen(plan(measure=True, qos=other), None)
+    assert clients.topics == ["/a"]
+    assert measurements._topics["/a"] is not before
+    measurements.listen(plan(measure=False), None)
+    assert (clients.topics, measurements.measured()) == ([], None)
+
+
+def test_nodes_that_a_plan_leaves_out_for_a_while_are_measured_on() -> None:
+    clients = Clients()
+    measurements = TopicMeasurements(clients)  # type: ignore[arg-type]
+    whole = plan(measure=True)
+    measurements.listen(whole, None)
+    before = measurements._topics["/a"]
+    measurements.listen(replace(whole, nodes=whole.nodes[:1]), None)
+    assert measurements._topics["/a"] is before
+
+
+def test_each_flow_is_measured_on_its_own_subscribers_machine() -> None:
+    both = planned(
+        node("one", publisher("a"), subscription("b"), run=FOREIGN, machine="near"),
+        node("two", subscription("a"), publisher("b"), run=FOREIGN, machine="far"),
+        links=[link("/a", "one", "two", measure=True), link("/b", "two", "one", measure=True)],
+        machines=tuple(Machine(name=each, at=at(2)) for each in ("near", "far")),
+    )
+    clients = Clients()
+    TopicMeasurements(clients).listen(both, {"far"})  # type: ignore[arg-type]
+    assert clients.topics == ["/a"]

@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import EndpointKind, Executor, Machine, Quantity, Run, RunKind
+from lifecycle.manifest.model import (
+    EndpointKind,
+    Executor,
+    Machine,
+    Quantity,
+    Run,
+    RunKind,
+    TargetState,
+)
 from lifecycle.measure.sample import Delays, Measured, Sample, Slot, buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import without_measured
@@ -14,7 +22,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import at, link, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import both, change_configuration
+from tests.unit.verify.edits import both, change_configuration, change_node
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -148,7 +156,9 @@ def test_nothing_is_judged_while_an_end_says_that_it_is_not_active(
     counted = change_configuration(
         "/two", measured=Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
     )
-    seen = both(counted, change_configuration(name, state=state))(perfect(plan, Stage.ACTIVE))
+    publishes = change_configuration("/one", measured=Measured(active_s=99))
+    edit = both(counted, publishes, change_configuration(name, state=state))
+    seen = edit(perfect(plan, Stage.ACTIVE))
     verdict = verify(plan, seen, stage=Stage.ACTIVE)
     assert len(verdict.measured) == len(of_data(verdict)) == judged_
 
@@ -205,7 +215,11 @@ def test_of_several_publishers_only_what_is_of_the_topic_is_measured() -> None:
     (own,) = (each for each in seen.endpoints if (each.kind, each.name) == (PUB, "/a"))
     seen = replace(seen, endpoints=(*seen.endpoints, replace(own, node="/other", gid="0f")))
     counted = Measured(active_s=10, samples=(("/a", sample),))
-    verdict = verify(plan, change_configuration("/two", measured=counted)(seen), stage=Stage.ACTIVE)
+    edit = both(
+        change_configuration("/one", measured=Measured(active_s=99)),
+        change_configuration("/two", measured=counted),
+    )
+    verdict = verify(plan, edit(seen), stage=Stage.ACTIVE)
     named = [(each.subject, each.expected) for each in of_data(verdict)]
     assert named == [("/a", "loss 0.01"), ("/a: /one → /two", "rate_hz 15")]
     assert [each.name for each in verdict.measured[0].bounds] == ["rate_hz", "max_delay_ms"]
@@ -237,7 +251,8 @@ def test_a_subscription_of_ours_measures_where_the_manifest_asks_for_it() -> Non
         node("two", subscription("a"), run=FOREIGN),
         links=[link("/a", "one", "two", quantities=(number("rate_hz", 15),), measure=True)],
     )
-    seen = perfect(plan, Stage.ACTIVE)
+    publishes = change_configuration("/one", measured=Measured(active_s=99))
+    seen = publishes(perfect(plan, Stage.ACTIVE))
     slow = Measured(active_s=0, samples=(("/a", arrived(50, 10)),))
     verdict = verify(plan, replace(seen, measured=slow), stage=Stage.ACTIVE)
     assert [each.rule for each in of_data(verdict)] == ["flow.rate"]
@@ -259,7 +274,7 @@ def test_a_subscription_of_ours_is_judged_by_the_supervisor_of_the_node_that_sub
         machines=tuple(Machine(name=each, at=at(2)) for each in ("near", "far")),
     )
     slow = Measured(active_s=0, samples=(("/a", arrived(50, 10)),))
-    seen = replace(perfect(plan, Stage.ACTIVE), measured=slow)
+    seen = replace(perfect(plan, Stage.ACTIVE), measured=slow, active_s=(("/one", 99),))
     found = {
         machine: [
             each.rule
@@ -277,3 +292,69 @@ def test_a_node_whose_executor_gives_no_message_info_is_named() -> None:
     found = of_data(judged(pair(number("rate_hz", 5), run=events), arrived(300, 10)))
     assert [each.rule for each in found] == ["flow.not-measured"]
     assert found[0].message.endswith("executor: events gives callbacks no message info")
+
+
+def test_a_number_of_a_topic_is_judged_while_one_of_its_publishers_is_active() -> None:
+    silence = number("max_silence_s", 2)
+    plan = planned(
+        node("one", publisher("a"), state=TargetState.INACTIVE),
+        node("other", publisher("a")),
+        node("two", subscription("a"), needs=[need(SUB, "a", quantities=(silence,))]),
+    )
+    silent = Measured(active_s=9, samples=(("/a", arrived(9, 10, silent_s=2.5)),))
+    seen = perfect(plan, Stage.ACTIVE)
+
+    def found(other_s: float) -> list[str]:
+        edit = both(
+            change_configuration("/two", measured=silent),
+            change_configuration("/other", measured=Measured(active_s=other_s)),
+        )
+        return [each.rule for each in of_data(verify(plan, edit(seen), stage=Stage.ACTIVE))]
+
+    assert found(99.0) == ["flow.silent"]
+    assert found(1.5) == []
+
+
+@pytest.mark.parametrize(("active_s", "rules"), [(1.0, []), (19.0, ["flow.rate"])])
+def test_what_a_node_of_others_did_not_send_before_it_was_there_is_no_fault(
+    active_s: float, rules: list[str]
+) -> None:
+    plan = planned(
+        node("one", publisher("a"), run=FOREIGN),
+        node("two", subscription("a")),
+        links=[link("/a", "one", "two", quantities=(number("rate_hz", 15),))],
+    )
+    slow = Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
+    seen = change_configuration("/two", measured=slow)(perfect(plan, Stage.ACTIVE))
+    seen = replace(seen, active_s=(("/one", active_s),))
+    assert [each.rule for each in of_data(verify(plan, seen, stage=Stage.ACTIVE))] == rules
+
+
+def test_nothing_is_judged_while_a_node_of_others_is_not_active() -> None:
+    plan = planned(
+        node("one", publisher("a"), run=FOREIGN),
+        node("two", subscription("a")),
+        links=[link("/a", "one", "two", quantities=(number("rate_hz", 15),))],
+    )
+    slow = Measured(active_s=9, samples=(("/a", arrived(50, 10)),))
+    edit = both(change_node("/one", state="inactive"), change_configuration("/two", measured=slow))
+    seen = edit(perfect(plan, Stage.ACTIVE))
+    assert of_data(verify(plan, seen, stage=Stage.ACTIVE)) == []
+
+
+@pytest.mark.parametrize("slow", [number("max_silence_s", 30), number("rate_hz", 0.04)], ids=str)
+def test_a_message_is_not_missed_before_what_is_declared_lets_it_be_late(slow: Quantity) -> None:
+    plan = pair(number("max_delay_ms", 5), slow)
+    assert of_data(judged(plan, arrived(0, 20, silent_s=20))) == []
+    (found, *_) = of_data(judged(plan, arrived(0, 31, silent_s=29)))
+    assert (found.rule, found.expected) == ("flow.nothing-arrived", "max_delay_ms 5")
+
+
+def test_a_node_of_ours_that_was_started_again_is_not_silent_before_it_says_how_long_it_runs() -> (
+    None
+):
+    plan = pair(number("max_silence_s", 1), number("rate_hz", 15))
+    late = Measured(active_s=9, samples=(("/a", arrived(90, 9, silent_s=4)),))
+    seen = change_configuration("/two", measured=late)(perfect(plan, Stage.ACTIVE))
+    again = change_configuration("/one", measured=None)(seen)
+    assert of_data(verify(plan, again, stage=Stage.ACTIVE)) == []

@@ -210,3 +210,21 @@ def test_a_number_is_measured_for_ten_seconds_also_where_no_look_ends() -> None:
         phases.append(play.phase)
     assert set(phases[:9]) == {"measuring"}
     assert set(phases[10:]) == {"active"}
+
+
+def test_nothing_is_decided_of_numbers_while_the_system_is_paused_or_a_process_is_away() -> None:
+    rate = (Quantity(name="rate_hz", value=9, at=HERE),)
+    data = planned_endpoint(EndpointKind.PUBLISHER, "data", quantities=rate)
+    node = replace(planned_node("a", supervision=AGAIN), endpoints=(data,))
+    play = Play(plan_of(node), ways={"a activate": "hang"}, stop_after_s=1.0)
+    play.ways["look"] = "hang"
+    play.finish("a activate")
+    play.give(messages.Verified(mark=play.held.pop().mark, verdict=play.found))
+    assert (play.phase, play.run.decided_s) == ("measuring", None)
+    play.order(ControlRequest.PAUSE)
+    del play.ways["look"]
+    play.finish("look")
+    play.wait(4.0)
+    assert (play.phase, play.run.decided_s) == ("paused", None)
+    play.order(ControlRequest.RESUME)
+    assert (play.phase, play.run.decided_s) == ("active", 4.0)

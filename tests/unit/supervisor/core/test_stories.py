@@ -455,6 +455,23 @@ def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resume
     assert play.levels == "4 4"
 
 
+@pytest.mark.parametrize("what", [Consequence.PAUSE, Consequence.DEACTIVATE])
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_run_that_ends_while_a_violation_keeps_it_inactive_is_no_success(
+    what: Consequence, resumed: bool
+) -> None:
+    plan = replace(chain(), on_violation=(Reaction(rule="param", what=what),))
+    play = Play(plan)
+    play.see(("param.value-differs", "/viewer"))
+    play.wait(1.0)
+    play.see()
+    if resumed:
+        play.order(ControlRequest.RESUME)
+    play.stop("terminated", ExitCode.TERMINATED)
+    play.wait(10.0)
+    assert play.code == (0 if resumed else 4)
+
+
 # What is no node's
 
 
