@@ -7,6 +7,7 @@ asked to load `demo/Fatal`.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from typing import Any
@@ -82,6 +83,8 @@ class Container(Node):
         name = node.get_fully_qualified_name()
         self._runs.remove_node(node)
         node.destroy_node()
+        del node
+        gc.collect()  # rclpy's service of type descriptions is in a cycle, and stays until then
         print(f"unloaded {name}", flush=True)
         return respond(response, success=True, error_message="", unique_id=0)
 
