@@ -1,8 +1,7 @@
 """The ROS graph on real DDS: the three layers of the graph interface put together.
 
-Owns: `Graph`, for programs that follow a ROS graph and for the supervisor that judges one. Both
-have the same state: fed by node statuses, by the configurations that nodes serve or that are put
-there, and by discovery. It sleeps until one of them has something new.
+Fed by node statuses, by the configurations that nodes serve or that are put there, and by
+discovery. It sleeps until one of them has something new.
 """
 
 from __future__ import annotations
@@ -118,9 +117,8 @@ class Graph(Observer):
     def observation(self, plan: Plan) -> Observation:
         """Return what there is of `plan` now and what there is besides, for `lifecycle.verify`.
 
-        Planned nodes are asked, all at once, which takes up to a second. Just after the graph was
-        made it waits until discovery is complete, up to 3.5 s. Not to be called in a callback, nor
-        with `in_loop`: there, `observe`.
+        It takes up to a second, and just after the graph was made up to 3.5 s. Not to be called in
+        a callback, nor with `in_loop`: there, `observe`.
         """
         if not self._loop.has_thread:
             raise TypeError("cannot wait for an observation in its own loop; await observe(plan)")
@@ -135,7 +133,7 @@ class Graph(Observer):
     def wait_for(self, holds: Callable[[GraphState], object], *, timeout_s: float) -> bool:
         """Wait until something holds of the state; False if it did not within `timeout_s`.
 
-        It is looked at after each change, never in between. Not to be called in a callback.
+        It is looked at after each change. Not to be called in a callback.
         """
         found = threading.Event()
 

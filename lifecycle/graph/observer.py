@@ -1,8 +1,7 @@
 """Brings the state of a graph up to date from discovery, nodes' services and statuses.
 
 Owns: what is asked of which node, and when, and whose answers count; which of discovery's nodes are
-members of the graph, and what counts as the configuration of one that serves none; when a change is
-worth another look. It looks when it is asked to, and when something happened.
+members of the graph; when a change is worth another look.
 """
 
 from __future__ import annotations
@@ -295,11 +294,7 @@ class Observer:
         self._to_follow.set()
 
     def _state_changed(self, change: GraphChange) -> None:
-        """Look again at a node that says something else of itself.
-
-        One whose configuration is put into the state reports its changes that way, and what was
-        answered already is no change.
-        """
+        """Look again at a node that says something else of itself than it answered, or reports."""
         name, after = change.node, change.after
         if after is not None and after.silent:
             self._loop.bind().call_later(FORGET_AFTER_S, self.state.forget, after)

@@ -222,9 +222,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         return tuple(each for each in self._accepted if each.is_active)
 
     def finish(self, goal: ServerGoalHandle, result: Any | None) -> None:
-        """Answer all that wait for a goal now, aborted if it has not ended; the first answer
-        counts.
-        """
+        """Answer who waits for a goal, aborted if it has not ended; the first answer counts."""
         futures = private(self, "_result_futures", "answer who waits for a goal")
         future = futures.get(bytes(goal.goal_id.uuid))
         if future is None or future.done():  # None: rcl has forgotten a goal that ended long ago
