@@ -68,7 +68,7 @@ def with_reply(node: Node, requests: list[ObservedEndpoint]) -> list[ObservedEnd
     hashes = [{each.type_hash or "" for each in side} for side in sides]
     type_hash = join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
     ends = (
-        replace(each, qos=None, type_hash=type_hash, gid="" if asks and each.node else each.gid)
+        replace(each, type_hash=type_hash, gid="" if asks and each.node else each.gid)
         for each in requests
     )
     return list(dict.fromkeys(ends))
@@ -170,7 +170,7 @@ def _observed(kind: EndpointKind, name: str, info: TopicEndpointInfo) -> Observe
         name=name,
         type=_ros_type(info.topic_type),
         gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
-        qos=from_rclpy(info.qos_profile),
+        qos=from_rclpy(info.qos_profile) if kind.is_topic else None,
         type_hash=str(announced) if announced.version > 0 else "",
     )
 
