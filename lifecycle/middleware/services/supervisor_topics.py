@@ -38,12 +38,12 @@ from rclpy.event_handler import (
 )
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Empty, String
+from std_msgs.msg import String
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.manifest.names import ALIVE_PULSE, DIAGNOSTICS_TOPIC, supervisor_status_topic
+from lifecycle.manifest.names import DIAGNOSTICS_TOPIC, supervisor_status_topic
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.conversions import latched
 
@@ -85,14 +85,9 @@ class AliveNotice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 _logger = logging.getLogger(__name__)
 
 
-_NOTICES = latched(1)
-_ASSERTED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
-    liveliness_lease_duration=Duration(nanoseconds=round(_LEASE_S * 1e9)),
-)
+_ALIVE = latched(1)
+_ALIVE.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+_ALIVE.liveliness_lease_duration = Duration(nanoseconds=round(_LEASE_S * 1e9))
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
 
@@ -116,14 +111,9 @@ class AlivePublisher:
         self._on_listener = on_listener
         self._has_listeners = threading.Event()
         self._ended = threading.Event()
-        # rclpy's own methods: a managed node's would gate them.
-        make = functools.partial(Node.create_publisher, node)
-        self._asserted = make(
-            Empty, topic + ALIVE_PULSE, _ASSERTED, event_callbacks=_no_publisher_events()
-        )
-        self._publisher = make(
-            String, topic, _NOTICES, event_callbacks=_no_publisher_events(matched=self._matched)
-        )
+        # rclpy's own method: a managed node's would gate it.
+        events = _no_publisher_events(matched=self._matched)
+        self._publisher = Node.create_publisher(node, String, topic, _ALIVE, event_callbacks=events)
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
@@ -139,8 +129,7 @@ class AlivePublisher:
         self._ended.set()
         self._has_listeners.set()
         self._thread.join()
-        for each in (self._asserted, self._publisher):
-            Node.destroy_publisher(self._node, each)
+        Node.destroy_publisher(self._node, self._publisher)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
         if info.current_count:
@@ -157,8 +146,8 @@ class AlivePublisher:
             # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen
             # not to give them back while peers left.
             try:
-                with self._asserted.handle:
-                    abi.assert_liveliness(self._asserted.handle.pointer)
+                with self._publisher.handle:
+                    abi.assert_liveliness(self._publisher.handle.pointer)
             except InvalidHandle:
                 return  # its node was destroyed first
             self._ended.wait(_ASSERTED_EACH_S)
@@ -205,23 +194,14 @@ class AliveSubscription:
             on_notice(notice, info["source_timestamp"], received_ns)
 
         self._node = node
-        self._subscriptions = (
-            node.create_subscription(
-                Empty,
-                topic + ALIVE_PULSE,
-                lambda _: None,  # nothing is published: the writer's liveliness is the message
-                _ASSERTED,
-                event_callbacks=_no_subscription_events(liveliness=changed),
-            ),
-            node.create_subscription(
-                String, topic, received, _NOTICES, event_callbacks=_no_subscription_events()
-            ),
+        events = _no_subscription_events(liveliness=changed)
+        self._subscription = node.create_subscription(
+            String, topic, received, _ALIVE, event_callbacks=events
         )
 
     def destroy(self) -> None:
-        """Destroy the subscriptions."""
-        for each in self._subscriptions:
-            self._node.destroy_subscription(each)
+        """Destroy the subscription."""
+        self._node.destroy_subscription(self._subscription)
 
 
 PLANS_TOPIC = "/_lifecycle/plans"
@@ -253,7 +233,7 @@ class PlanNotices:
             node,
             String,
             PLANS_TOPIC,
-            _NOTICES,
+            latched(1),
             event_callbacks=_no_publisher_events(matched=self._matched),
         )
 
