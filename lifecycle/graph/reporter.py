@@ -104,7 +104,7 @@ class GraphReporter:
             if self._reported:
                 self._send(msgspec.structs.replace(self._status, left=True, reason=reason))
             self._publisher = None
-        # What has not arrived goes with its publisher: observed in one of six tries under load.
+        # What has not arrived goes with its publisher.
         publisher.wait_for_all_acked(Duration(seconds=_FAREWELL_S))
         Node.destroy_publisher(self._node, publisher)
 

@@ -194,10 +194,15 @@ class GraphObserver:
             if each.node:
                 has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
-            # Of plain DDS programs only what has the names of ROS concerns a system of ROS.
-            raw = each.name.startswith(RAW)
-            is_kept = each.node if raw else names.keeps(each, each.node, ours=False)
-            if is_kept or each.kind in OF_SERVICES:
+            # Of plain DDS programs only what has the names of ROS concerns a system of ROS; of what
+            # is about to have a node, services that are looked for.
+            if each.kind in OF_SERVICES:
+                is_kept = bool(each.node) or names.has(each.kind, each.name)
+            elif each.name.startswith(RAW):
+                is_kept = bool(each.node)
+            else:
+                is_kept = names.keeps(each, each.node, ours=False)
+            if is_kept:
                 shown.setdefault(each.node, []).append(self._timed(each))
         for name in () if OVER_DDS else homes:
             shown.setdefault(name, []).extend(services_of_node(self.node, name))
