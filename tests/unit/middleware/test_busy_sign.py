@@ -232,7 +232,7 @@ def test_another_process_shows_where_it_stands_and_what_it_does() -> None:
         deadline = time.monotonic() + 10
         while not sign.what and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert "test_stacks.py" in sign.where(child)
+        assert "test_busy_sign.py" in sign.where(child)
         assert sign.where(child).count("test_another_process") == 1  # each time what is now
         assert sign.what == "of the service /reset"
     finally:
