@@ -88,8 +88,13 @@ _logger = logging.getLogger(__name__)
 _ALIVE = latched(1)
 _ALIVE.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
 _ALIVE.liveliness_lease_duration = Duration(nanoseconds=round(_LEASE_S * 1e9))
-_no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
+
+
+def _publisher(node: Node, type_: type[Any], topic: str, qos: QoSProfile, **events: Any) -> Any:
+    """Make a publisher by rclpy's own method: a managed node's would gate it."""
+    callbacks = PublisherEventCallbacks(use_default_callbacks=False, **events)
+    return Node.create_publisher(node, type_, topic, qos, event_callbacks=callbacks)
 
 
 @typing.final
@@ -111,9 +116,7 @@ class AlivePublisher:
         self._on_listener = on_listener
         self._has_listeners = threading.Event()
         self._ended = threading.Event()
-        # rclpy's own method: a managed node's would gate it.
-        events = _no_publisher_events(matched=self._matched)
-        self._publisher = Node.create_publisher(node, String, topic, _ALIVE, event_callbacks=events)
+        self._publisher = _publisher(node, String, topic, _ALIVE, matched=self._matched)
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
@@ -132,12 +135,10 @@ class AlivePublisher:
         Node.destroy_publisher(self._node, self._publisher)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
-        if info.current_count:
-            self._has_listeners.set()
-        else:
+        if not info.current_count:
             self._has_listeners.clear()
-            if self._ended.is_set():
-                self._has_listeners.set()
+        if info.current_count or self._ended.is_set():
+            self._has_listeners.set()
         if info.current_count_change > 0 and self._on_listener is not None:
             self._on_listener()
 
@@ -228,14 +229,7 @@ class PlanNotices:
             latched(_KEPT),
             event_callbacks=_no_subscription_events(),
         )
-        # rclpy's own methods: a managed node's would gate them.
-        self._publisher = Node.create_publisher(
-            node,
-            String,
-            PLANS_TOPIC,
-            latched(1),
-            event_callbacks=_no_publisher_events(matched=self._matched),
-        )
+        self._publisher = _publisher(node, String, PLANS_TOPIC, latched(1), matched=self._matched)
 
     def announce(self, text: str) -> None:
         """Publish `text` to present and later subscribers; from any thread."""
@@ -292,25 +286,10 @@ class RosInterface:
         self._on_call = on_call
         # Others are served while one call waits for its answer.
         group = ReentrantCallbackGroup()
-        # rclpy's own methods, as everywhere on an observer's node.
-        self._status = Node.create_publisher(
-            node,
-            String,
-            supervisor_status_topic(prefix),
-            latched(1),
-            event_callbacks=_no_publisher_events(),
-        )
-        self._diagnostics = (
-            Node.create_publisher(
-                node,
-                DiagnosticArray,
-                DIAGNOSTICS_TOPIC,
-                _DIAGNOSTICS,
-                event_callbacks=_no_publisher_events(),
-            )
-            if diagnoses
-            else None
-        )
+        self._status = _publisher(node, String, supervisor_status_topic(prefix), latched(1))
+        self._diagnostics = None
+        if diagnoses:
+            self._diagnostics = _publisher(node, DiagnosticArray, DIAGNOSTICS_TOPIC, _DIAGNOSTICS)
         self._services = tuple(
             Node.create_service(
                 node, Trigger, f"{prefix}/{name}", self._served(name), callback_group=group
