@@ -29,8 +29,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own 
 from msgspec.structs import replace
 
 from benchmarks import scale
+from lifecycle.graph.graph import Graph
 from lifecycle.graph.loop import GraphLoop
-from lifecycle.graph.observer import Observer
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.status import NodeStatus, decode, encode
 from lifecycle.manifest.loading import load
@@ -189,7 +189,7 @@ class Supervised:
         self.shown: Any = Shown(seen)
         self._configurations = seen.configurations
         loop = GraphLoop(own_thread=False)
-        self._graph = Observer(self.shown, None, loop)  # type: ignore[arg-type]
+        self._graph = Graph(self.shown, None, loop)  # type: ignore[arg-type]
         system: Any = World(plan, folder).system
         peers: Any = Peers(system, None)  # type: ignore[arg-type]
         self.state: Any = self

@@ -18,7 +18,6 @@ import msgspec
 
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.names import (
-    ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MANAGED_SERVICES,
     NODE_SERVICES,
@@ -165,8 +164,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
             allowed |= {(EndpointKind.SUBSCRIPTION, each) for each in _node_topics(node)}
     for other in plan.machines:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
-        topic = supervisor_alive_topic(plan.system, other.name)
-        allowed |= {(kind, topic), (kind, f"{topic}{ALIVE_PULSE}")}
+        allowed.add((kind, supervisor_alive_topic(plan.system, other.name)))
     if any(node.health is not None and node.health.diagnostics for node in plan.nodes):
         allowed.add((EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC))
     several = len({each.machine for each in plan.nodes}) > 1
@@ -175,8 +173,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
 
 
 def _node_topics(node: PlannedNode) -> tuple[str, ...]:
-    names = ("transition_event", "_alive", "_alive_pulse")
-    return tuple(f"{node.full_name}/{name}" for name in names)
+    return tuple(f"{node.full_name}/{name}" for name in ("transition_event", "_alive"))
 
 
 def _chosen(process: PlannedProcess) -> str:

@@ -1,8 +1,7 @@
 """Graph events, layer 2 of the graph interface: what happened, and who is notified.
 
-Owns: which events a change of a node makes. Those of a node's state, configuration, connections and
-mappings are the difference between two statuses of it, those of its endpoints the difference
-between two configurations. Pure.
+Those of a node's state, configuration, connections and mappings are the difference between two
+statuses of it, those of its endpoints the difference between two configurations. Pure.
 """
 
 from __future__ import annotations

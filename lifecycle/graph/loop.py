@@ -90,7 +90,7 @@ async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:
 
     asyncio.wait_for of Python 3.10 and 3.11 returns normally when it is cancelled in the moment in
     which what it waits for comes true (python/cpython#86296): a task that waits in a loop then
-    outlives its cancellation, and who waits for its end waits for ever.
+    outlives its cancellation.
     """
     waiting = asyncio.ensure_future(event.wait())
     try:

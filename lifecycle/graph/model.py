@@ -1,8 +1,7 @@
 """Types of a graph's state: node views, what changes about them, ends and links.
 
-Owns: what is different between two views of a node; and the link of a publisher with a
-subscription. Whether two are matched is judged as `lifecycle.verify` judges it
-(`verify/rules/matching.py`). Pure.
+Whether two are matched is judged as `lifecycle.verify` judges it (`verify/rules/matching.py`).
+Pure.
 """
 
 from __future__ import annotations
@@ -174,15 +173,7 @@ def link(
     publishers: Sequence[SeenEndpoint],
     subscriptions: Sequence[SeenEndpoint],
 ) -> Link:
-    """Judge one pair.
-
-    Args:
-        topic: the name by which they meet.
-        publisher: one end.
-        subscription: the other end.
-        publishers: every publisher of this topic, see `match_ends`.
-        subscriptions: every subscription of it.
-    """
+    """Judge a pair of a topic, of which `match_ends` has all publishers and subscriptions."""
     nfes = publisher.endpoint.nfes or (), subscription.endpoint.nfes or ()
     transport = carrier(*nfes, _identity(publisher), _identity(subscription))
     source, destination = _match_end(publisher), _match_end(subscription)

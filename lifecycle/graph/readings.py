@@ -1,11 +1,9 @@
 """What is read of nodes beside discovery: parameters, /diagnostics, messages of their topics.
 
-Owns: when the parameters of nodes that do not report them are read. Once when a node is there,
-again when `/parameter_events` says that one of them changed, and else rarely: rclpy publishes no
-event for a parameter that is undeclared, rclcpp need not publish any, and an event may pass before
-our subscription is matched. Which entries of /diagnostics count for which node, for how long, and
-what they mean together. And what arrives at subscriptions of our own, made where a manifest asks
-for it (`measure: true`).
+The parameters of nodes that do not report them are read once when a node is there, again when
+`/parameter_events` says that one of them changed, and else rarely: rclpy publishes no event for a
+parameter that is undeclared, rclcpp need not publish any, and an event may pass before our
+subscription is matched. Topics are measured so where a manifest asks for it (`measure: true`).
 """
 
 from __future__ import annotations
@@ -66,10 +64,7 @@ Names = frozenset[str] | None
 class ParameterReadings:
     """The parameters of some nodes, kept as they are. To be used in a graph's loop.
 
-    Args:
-        clients: where they are read.
-        loop: of the graph.
-        wake: called when they are others than before.
+    `wake` is called when they are others than before.
     """
 
     def __init__(self, clients: NodeClients, loop: GraphLoop, wake: Callable[[], None]) -> None:
@@ -125,10 +120,7 @@ class ParameterReadings:
             self.forget(name)
 
     def reread(self, node: str | None = None) -> bool:
-        """Have the next `follow` wait for readings that begin now; return whether any does.
-
-        A node need not publish that its parameters changed, and its transitions may change them.
-        """
+        """Have the next `follow` wait for readings that begin now; return whether any does."""
         nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:
             each.task.cancel()

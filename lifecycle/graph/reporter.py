@@ -1,8 +1,7 @@
 """Sending and receiving node statuses over DDS, layer 1 of the graph interface.
 
-Owns: the graph topic's QoS, the publisher of a node that reports itself and the subscription of who
-follows a graph: one JSON document in each message. DDS keeps the last status of each node for who
-comes later, sends again what was lost, and delivers a writer's statuses in their order.
+One JSON document in each message. DDS keeps the last status of each node for who comes later, sends
+again what was lost, and delivers a writer's statuses in their order.
 """
 
 from __future__ import annotations
@@ -51,9 +50,6 @@ class GraphReporter:
     """Reports one node to the graph from the first `report` until `left`. Every method: any thread.
 
     A status that the RMW does not take is logged, never raised: a node works without the graph.
-
-    Args:
-        node: to report; any rclpy node.
     """
 
     def __init__(self, node: Node) -> None:
@@ -108,7 +104,7 @@ class GraphReporter:
             if self._reported:
                 self._send(msgspec.structs.replace(self._status, left=True, reason=reason))
             self._publisher = None
-        # What has not arrived goes with its publisher: observed in one of six tries under load.
+        # What has not arrived goes with its publisher.
         publisher.wait_for_all_acked(Duration(seconds=_FAREWELL_S))
         Node.destroy_publisher(self._node, publisher)
 
@@ -125,10 +121,8 @@ class GraphReporter:
 def receive(node: Node, callback: Callable[[NodeStatus], None]) -> Callable[[], None]:
     """Have `callback` called with the status of each node and with each later one.
 
-    It is called in the executor that spins `node`. What is no status is logged and passed over.
-
-    Returns:
-        A function that ends it, to be called before the node is destroyed.
+    It is called in the executor that spins `node`. Returns what ends it, before the node is
+    destroyed.
     """
 
     def arrived(message: String) -> None:

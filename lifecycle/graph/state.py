@@ -90,16 +90,7 @@ class GraphState:
         return tuple(sorted({each.resolved for each in endpoints if each.kind.is_topic}))
 
     def connected(self, topic: str, publisher: str, subscription: str) -> tuple[Link, ...]:
-        """Return how two nodes are connected by a topic.
-
-        Args:
-            topic: fully qualified.
-            publisher: fully qualified name of the publishing node.
-            subscription: of the subscribing node.
-
-        Returns:
-            One link for each pair of their endpoints, usually one; none if either has no endpoint.
-        """
+        """Return how two nodes (full names) are connected by a topic, by pairs of endpoints."""
         return tuple(
             each
             for each in self.flows(topic)
@@ -163,8 +154,8 @@ class GraphState:
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what was learnt of a node in another way, over a control channel say.
 
-        A node that sends no statuses becomes a member by it. For `observation` it is what the node
-        reports until a newer one is put, the node leaves the graph or it is dropped.
+        For `observation` it is what the node reports until a newer one is put, the node leaves the
+        graph or it is dropped.
         """
         name = configuration.name
         with self._lock:

@@ -1,10 +1,8 @@
 """Node statuses: what each node of a graph says of itself to all others, and its JSON.
 
-Owns: the message of the graph topic (schema: schemas/node_status.v1.schema.json). How it travels is
-reporter.py's. Pure.
-
-A status is all that its node has to say: the last one holds, whatever was lost before it. See
-*Topological Discovery and Communication Negotiation*, "Graph Interface".
+The message of the graph topic (schema: schemas/node_status.v1.schema.json) is all that its node has
+to say: the last one holds, whatever was lost before it. Pure. See *Topological Discovery and
+Communication Negotiation*, "Graph Interface".
 """
 
 from __future__ import annotations

@@ -351,7 +351,6 @@ DIAGNOSTICS_TOPIC = "/diagnostics"
 SUPERVISORS = "/lifecycle/"
 """What the names of all status topics and services of supervisors begin with."""
 SUPERVISOR_STATUS = "status"
-ALIVE_PULSE = "_pulse"
 MODE_SERVICE = "mode/"
 """What the names of services begin with, below a supervisor's prefix, that enter a mode."""
 _READING = ("get_status",)
@@ -373,10 +372,7 @@ def supervisor_status_topic(prefix: str) -> str:
 
 
 def supervisor_alive_topic(system: str, machine: str) -> str:
-    """Return the hidden topic on which the supervisor of a machine asserts its liveliness.
-
-    What it asserts is the liveliness of a second topic, of this name and `ALIVE_PULSE`.
-    """
+    """Return the hidden topic on which the supervisor of a machine asserts its liveliness."""
     return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
 
 

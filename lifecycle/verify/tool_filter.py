@@ -76,7 +76,6 @@ OURS_BY = frozenset({"get_configuration", "map_to"})
 
 NODE_TOPICS: Mapping[str, str] = {
     "_alive": "std_msgs/msg/String",
-    "_alive_pulse": "std_msgs/msg/Empty",
     "transition_event": "lifecycle_msgs/msg/TransitionEvent",
 }
 """Topics that a node publishes under its own name, and their types."""

@@ -19,7 +19,7 @@ from tests.net.nine_systems import on_two_hosts_by_tcp
 from tests.net.running import DOMAIN, up_on_both
 from tests.ros.supervisor.running import Up
 from tests.stalls import TRIES, Stalls, assert_in_time, noted_stalls
-from tests.unit.middleware.test_retransmission import KNOWN
+from tests.unit.middleware.test_sockets import KNOWN
 
 pytestmark = pytest.mark.alone
 

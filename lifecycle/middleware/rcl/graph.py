@@ -1,10 +1,7 @@
 """ROS graph observer: snapshots of nodes and endpoints as discovery shows them, without polling.
 
-Owns: the observer's participant, and what of the graph's answers is a node, its endpoints and its
-services. Entities that tools add are left out by `lifecycle.verify.tool_filter`.
-
-A node is there while an endpoint is its own: rmw_dds_common may keep the names of nodes that have
-left.
+Entities that tools add are left out by `lifecycle.verify.tool_filter`. A node is there while an
+endpoint is its own: rmw_dds_common may keep the names of nodes that have left.
 """
 
 from __future__ import annotations
@@ -90,12 +87,12 @@ class GraphObserver:
     """What discovery shows of the graph of one domain, to a hidden node of its own.
 
     Make it before starting what it is to see. `destroy` it, or use it in a `with`. Every method may
-    be called from any thread. `GraphObserver.on` looks through a node that is there already.
+    be called from any thread.
 
     Args:
         domain_id: 0–232.
-        connections: how it is connected; as a client of a discovery server it is a super client,
-            to which everything is announced.
+        connections: how it is connected; as a client of a discovery server it is a super client, to
+            which everything is announced.
         node: looked through instead of a hidden one, see `on`.
 
     Attributes:
@@ -159,26 +156,22 @@ class GraphObserver:
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         """Have `callback` called in the guard's thread after each change of the graph.
 
-        It must be quick and must not destroy the observer.
-
-        Returns:
-            A function that takes the callback away again.
+        It must be quick and must not destroy the observer. Returns what takes it away again.
         """
         return self._guard.follow(self.node, callback)
 
     def snapshot(self, *, names: DeclaredNames = NO_NAMES) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
-        All but its own node, of which there is only what has one of these `names`. The
-        housekeeping of client libraries is left out.
+        All but its own node, of which there is only what has one of these `names`. The housekeeping
+        of client libraries is left out.
 
         Args:
             names: of topics, services and actions that are looked for: a node that offers one of
                 them and is not declared is shown, whatever it looks like.
 
         Raises:
-            MiddlewareError: the graph is no longer watched, or cannot be read; the message says
-                why.
+            MiddlewareError: the graph is no longer watched, or cannot be read.
         """
         if self._guard.failure is not None:
             raise self._guard.failure
@@ -201,10 +194,15 @@ class GraphObserver:
             if each.node:
                 has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
-            # Of plain DDS programs only what has the names of ROS concerns a system of ROS.
-            raw = each.name.startswith(RAW)
-            is_kept = each.node if raw else names.keeps(each, each.node, ours=False)
-            if is_kept or each.kind in OF_SERVICES:
+            # Of plain DDS programs only what has the names of ROS concerns a system of ROS; of what
+            # is about to have a node, services that are looked for.
+            if each.kind in OF_SERVICES:
+                is_kept = bool(each.node) or names.has(each.kind, each.name)
+            elif each.name.startswith(RAW):
+                is_kept = bool(each.node)
+            else:
+                is_kept = names.keeps(each, each.node, ours=False)
+            if is_kept:
                 shown.setdefault(each.node, []).append(self._timed(each))
         for name in () if OVER_DDS else homes:
             shown.setdefault(name, []).extend(services_of_node(self.node, name))
@@ -244,11 +242,7 @@ class GraphObserver:
         return self._homes()[1]
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
-        """Return which nodes of this machine are in hosts of ours, see `process/hosted.py`.
-
-        Args:
-            nodes: fully qualified names; those on other machines are not in the result.
-        """
+        """Return which of the nodes of this machine are in hosts of ours, see `prefixes`."""
         homes, own = self._homes()
         found = {}
         for name in nodes:
@@ -273,7 +267,7 @@ class GraphObserver:
         """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
 
         What Fast DDS has not agreed on with a server by then it never will: make another observer,
-        on another port. Without such servers there is nothing to wait for.
+        on another port.
         """
         deadline = time.monotonic() + _AGREED_S
         servers = [
@@ -296,8 +290,8 @@ class GraphObserver:
         Args:
             pid: of a process on this host that has ended.
             nodes: fully qualified names of nodes that it ran.
-            reported: GUID prefixes that these nodes said are theirs. Of both only those count
-                that bear this host and this pid.
+            reported: GUID prefixes that these nodes said are theirs. Of both only those count that
+                bear this host and this pid.
         """
         if self._destroyed:
             return
@@ -311,11 +305,7 @@ class GraphObserver:
         self._guard.notify()  # what it had made may be without a name yet
 
     def ended_participant(self, prefix: str) -> None:
-        """Count participants of an ended process no more.
-
-        Args:
-            prefix: of the GUID of one of them, 24 hex digits.
-        """
+        """Count participants of an ended process no more, by the GUID prefix of one of them."""
         self._count_no_more((prefix,), self.prefix)
 
     def _count_no_more(self, prefixes: Iterable[str], own: str) -> None:
@@ -345,13 +335,9 @@ class GraphObserver:
         return homes, next(iter(homes.get(self._name, ())), "")
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
-        """Return how the processes of this host's nodes were started.
+        """Return how the processes of this host's nodes were started, by node and GUID prefix.
 
-        Args:
-            environment: variables that differ from these are reported.
-
-        Returns:
-            By full node name and GUID prefix (24 hex digits) of its participants.
+        Variables that differ from `environment` are reported.
         """
         from lifecycle.middleware.process.process_table import programs_of
 
@@ -419,10 +405,9 @@ class GraphObserver:
             yield from with_reply(self.node, found)
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
-        """Add their participants' addresses to endpoints of no known node.
+        """Add their participants' addresses to endpoints of no known node, as far as they answered.
 
-        One whose address is not known is asked for it: it answers within a moment, and the next
-        look has it.
+        Others are asked, and the next look has it.
         """
         known = self.settling.prober.answers()
         for endpoint in endpoints:
@@ -443,10 +428,9 @@ _SUPER_CLIENT_VARIABLE = "ROS_SUPER_CLIENT"
 
 @contextlib.contextmanager
 def _as_super_client() -> Iterator[None]:
-    """Have a participant that is a client of the user's discovery server receive everything.
+    """Have a client of the user's discovery server receive all, not what matches its endpoints.
 
-    A client is announced what matches its own endpoints, and nothing else. Fast DDS 2.14 looks at
-    the variable when a participant is made.
+    Fast DDS 2.14 looks at the variable when a participant is made.
     """
     if not os.environ.get(DISCOVERY_SERVER_VARIABLE) or _SUPER_CLIENT_VARIABLE in os.environ:
         yield

@@ -1,9 +1,7 @@
 """The graph queries of rclpy, put with the names that the RMW has, and answered in our types.
 
-Owns: how names of ROS and of DDS become each other, and what is made of answers that rclpy cannot
-give. Names of DDS are neither expanded nor validated by rclpy (`no_mangle`, `no_demangle`).
-
-Any participant may announce names that are no UTF-8, at which rclpy's queries raise. Such a name is
+Names of DDS are neither expanded nor validated by rclpy (`no_mangle`, `no_demangle`). Any
+participant may announce names that are no UTF-8, at which rclpy's queries raise. Such a name is
 shown escaped, and a topic of which nothing can be read as one of an unknown node: neither is ever
 verified.
 """
@@ -70,7 +68,7 @@ def with_reply(node: Node, requests: list[ObservedEndpoint]) -> list[ObservedEnd
     hashes = [{each.type_hash or "" for each in side} for side in sides]
     type_hash = join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
     ends = (
-        replace(each, qos=None, type_hash=type_hash, gid="" if asks and each.node else each.gid)
+        replace(each, type_hash=type_hash, gid="" if asks and each.node else each.gid)
         for each in requests
     )
     return list(dict.fromkeys(ends))
@@ -96,12 +94,8 @@ def endpoints_in(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint
 def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str], str]:
     """Return the topics that the RMW has, and one name that is no UTF-8, escaped; else empty.
 
-    Args:
-        node: that queries.
-        otherwise: where there is such a name rclpy says no other; then these are returned.
-
-    Raises:
-        MiddlewareError: they cannot be read.
+    Where there is one rclpy says no other: then those that are looked for `otherwise` are returned.
+    Raises MiddlewareError where they cannot be read.
     """
     try:
         found = node.get_topic_names_and_types(no_demangle=True)
@@ -131,8 +125,7 @@ def endpoints_of_node(
 ) -> tuple[tuple[str, str], ...] | None:
     """Return name and type of a node's publishers, subscriptions, servers or clients.
 
-    Returns:
-        None where rcl shows no such node: it has left, or has a name that no rcl would give it.
+    None where rcl shows no such node: it has left, or has a name that no rcl would give it.
     """
     query = {
         EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
@@ -177,7 +170,7 @@ def _observed(kind: EndpointKind, name: str, info: TopicEndpointInfo) -> Observe
         name=name,
         type=_ros_type(info.topic_type),
         gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
-        qos=from_rclpy(info.qos_profile),
+        qos=from_rclpy(info.qos_profile) if kind.is_topic else None,
         type_hash=str(announced) if announced.version > 0 else "",
     )
 

@@ -38,12 +38,12 @@ from rclpy.event_handler import (
 )
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.task import Future
-from std_msgs.msg import Empty, String
+from std_msgs.msg import String
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.manifest.names import ALIVE_PULSE, DIAGNOSTICS_TOPIC, supervisor_status_topic
+from lifecycle.manifest.names import DIAGNOSTICS_TOPIC, supervisor_status_topic
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.conversions import latched
 
@@ -85,16 +85,16 @@ class AliveNotice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 _logger = logging.getLogger(__name__)
 
 
-_NOTICES = latched(1)
-_ASSERTED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
-    liveliness_lease_duration=Duration(nanoseconds=round(_LEASE_S * 1e9)),
-)
-_no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
+_ALIVE = latched(1)
+_ALIVE.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+_ALIVE.liveliness_lease_duration = Duration(nanoseconds=round(_LEASE_S * 1e9))
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
+
+
+def _publisher(node: Node, type_: type[Any], topic: str, qos: QoSProfile, **events: Any) -> Any:
+    """Make a publisher by rclpy's own method: a managed node's would gate it."""
+    callbacks = PublisherEventCallbacks(use_default_callbacks=False, **events)
+    return Node.create_publisher(node, type_, topic, qos, event_callbacks=callbacks)
 
 
 @typing.final
@@ -116,14 +116,7 @@ class AlivePublisher:
         self._on_listener = on_listener
         self._has_listeners = threading.Event()
         self._ended = threading.Event()
-        # rclpy's own methods: a managed node's would gate them.
-        make = functools.partial(Node.create_publisher, node)
-        self._asserted = make(
-            Empty, topic + ALIVE_PULSE, _ASSERTED, event_callbacks=_no_publisher_events()
-        )
-        self._publisher = make(
-            String, topic, _NOTICES, event_callbacks=_no_publisher_events(matched=self._matched)
-        )
+        self._publisher = _publisher(node, String, topic, _ALIVE, matched=self._matched)
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
         self._thread.start()
 
@@ -139,16 +132,13 @@ class AlivePublisher:
         self._ended.set()
         self._has_listeners.set()
         self._thread.join()
-        for each in (self._asserted, self._publisher):
-            Node.destroy_publisher(self._node, each)
+        Node.destroy_publisher(self._node, self._publisher)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
-        if info.current_count:
-            self._has_listeners.set()
-        else:
+        if not info.current_count:
             self._has_listeners.clear()
-            if self._ended.is_set():
-                self._has_listeners.set()
+        if info.current_count or self._ended.is_set():
+            self._has_listeners.set()
         if info.current_count_change > 0 and self._on_listener is not None:
             self._on_listener()
 
@@ -157,8 +147,8 @@ class AlivePublisher:
             # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen
             # not to give them back while peers left.
             try:
-                with self._asserted.handle:
-                    abi.assert_liveliness(self._asserted.handle.pointer)
+                with self._publisher.handle:
+                    abi.assert_liveliness(self._publisher.handle.pointer)
             except InvalidHandle:
                 return  # its node was destroyed first
             self._ended.wait(_ASSERTED_EACH_S)
@@ -205,23 +195,14 @@ class AliveSubscription:
             on_notice(notice, info["source_timestamp"], received_ns)
 
         self._node = node
-        self._subscriptions = (
-            node.create_subscription(
-                Empty,
-                topic + ALIVE_PULSE,
-                lambda _: None,  # nothing is published: the writer's liveliness is the message
-                _ASSERTED,
-                event_callbacks=_no_subscription_events(liveliness=changed),
-            ),
-            node.create_subscription(
-                String, topic, received, _NOTICES, event_callbacks=_no_subscription_events()
-            ),
+        events = _no_subscription_events(liveliness=changed)
+        self._subscription = node.create_subscription(
+            String, topic, received, _ALIVE, event_callbacks=events
         )
 
     def destroy(self) -> None:
-        """Destroy the subscriptions."""
-        for each in self._subscriptions:
-            self._node.destroy_subscription(each)
+        """Destroy the subscription."""
+        self._node.destroy_subscription(self._subscription)
 
 
 PLANS_TOPIC = "/_lifecycle/plans"
@@ -248,14 +229,7 @@ class PlanNotices:
             latched(_KEPT),
             event_callbacks=_no_subscription_events(),
         )
-        # rclpy's own methods: a managed node's would gate them.
-        self._publisher = Node.create_publisher(
-            node,
-            String,
-            PLANS_TOPIC,
-            _NOTICES,
-            event_callbacks=_no_publisher_events(matched=self._matched),
-        )
+        self._publisher = _publisher(node, String, PLANS_TOPIC, latched(1), matched=self._matched)
 
     def announce(self, text: str) -> None:
         """Publish `text` to present and later subscribers; from any thread."""
@@ -312,25 +286,10 @@ class RosInterface:
         self._on_call = on_call
         # Others are served while one call waits for its answer.
         group = ReentrantCallbackGroup()
-        # rclpy's own methods, as everywhere on an observer's node.
-        self._status = Node.create_publisher(
-            node,
-            String,
-            supervisor_status_topic(prefix),
-            latched(1),
-            event_callbacks=_no_publisher_events(),
-        )
-        self._diagnostics = (
-            Node.create_publisher(
-                node,
-                DiagnosticArray,
-                DIAGNOSTICS_TOPIC,
-                _DIAGNOSTICS,
-                event_callbacks=_no_publisher_events(),
-            )
-            if diagnoses
-            else None
-        )
+        self._status = _publisher(node, String, supervisor_status_topic(prefix), latched(1))
+        self._diagnostics = None
+        if diagnoses:
+            self._diagnostics = _publisher(node, DiagnosticArray, DIAGNOSTICS_TOPIC, _DIAGNOSTICS)
         self._services = tuple(
             Node.create_service(
                 node, Trigger, f"{prefix}/{name}", self._served(name), callback_group=group

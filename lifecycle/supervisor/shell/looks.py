@@ -73,7 +73,7 @@ DISCOVERED_S = 3.5
 default: a node of ours may be matched with it for so long before our participant knows it."""
 
 HEALTH_S = 5.0
-"""Who publishes its health does so within this time, or it counts as stale (graph/observer.py): a
+"""Who publishes its health does so within this time, or it counts as stale (graph/graph.py): a
 node that must be healthy, and has not said how it is, is waited for no longer."""
 
 

@@ -11,8 +11,8 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph.graph import Graph
 from lifecycle.graph.loop import GraphLoop
-from lifecycle.graph.observer import Observer
 from lifecycle.graph.readings import Diagnostic, DiagnosticReadings
 from lifecycle.manifest.model import (
     After,
@@ -153,13 +153,13 @@ def clients() -> FakeClients:
     return FakeClients()
 
 
-def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Observer:
+def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Graph:
     """An observer as a supervisor has it."""
-    return Observer(graph, clients, GraphLoop(own_thread=False), **options)
+    return Graph(graph, clients, GraphLoop(own_thread=False), **options)
 
 
 @pytest.fixture
-def observer(graph: FakeGraph, clients: FakeClients) -> Observer:
+def observer(graph: FakeGraph, clients: FakeClients) -> Graph:
     return observing(graph, clients)
 
 
@@ -175,7 +175,7 @@ def managed(*names: str) -> tuple[ObservedNode, ...]:
 
 
 def test_planned_nodes_are_asked_and_others_only_seen(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes, graph.endpoints = managed("/a", "/other"), (VIDEO,)
     clients.states = {"/a": "inactive", "/other": "active"}
@@ -193,7 +193,7 @@ def test_planned_nodes_are_asked_and_others_only_seen(
 
 
 def test_a_node_without_lifecycle_services_is_not_asked_for_its_state(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = (ObservedNode(full_name="/a", managed=False),)
     clients.configurations = {"/a": configuration("/a", state="active")}
@@ -218,7 +218,7 @@ def test_a_node_without_lifecycle_services_is_not_asked_for_its_state(
 def test_a_node_is_believed_of_itself_in_a_host_of_ours_only(
     graph: FakeGraph,
     clients: FakeClients,
-    observer: Observer,
+    observer: Graph,
     kind: RunKind,
     where: str,
     *,
@@ -238,7 +238,7 @@ def test_a_node_is_believed_of_itself_in_a_host_of_ours_only(
 
 
 def test_what_was_put_is_believed_and_not_asked_for(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/a")
     clients.states = {"/a": "unconfigured"}
@@ -250,7 +250,7 @@ def test_what_was_put_is_believed_and_not_asked_for(
 
 
 def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
-    observer: Observer, graph: FakeGraph
+    observer: Graph, graph: FakeGraph
 ) -> None:
     observer.state.put_configuration(configuration("/a"))
     assert run(observer.observe(plan("a"))).configurations == (configuration("/a"),)
@@ -261,7 +261,7 @@ def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
 
 
 def test_a_node_that_does_not_answer_has_no_state_and_the_log_says_why(
-    observer: Observer, graph: FakeGraph, caplog: pytest.LogCaptureFixture
+    observer: Graph, graph: FakeGraph, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     graph.nodes = managed("/a")
@@ -272,7 +272,7 @@ def test_a_node_that_does_not_answer_has_no_state_and_the_log_says_why(
 
 
 def test_a_node_that_left_is_forgotten_once(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes, clients.states = managed("/a"), {"/a": "active"}
     run(observer.observe(plan("a")))
@@ -282,11 +282,11 @@ def test_a_node_that_left_is_forgotten_once(
     assert clients.forgotten == ["/a"]
 
 
-def test_nothing_was_looked_at_yet_counts_as_a_change(observer: Observer) -> None:
+def test_nothing_was_looked_at_yet_counts_as_a_change(observer: Graph) -> None:
     run(observer.wait_change())
 
 
-def test_a_look_uses_up_the_changes_before_it(observer: Observer, graph: FakeGraph) -> None:
+def test_a_look_uses_up_the_changes_before_it(observer: Graph, graph: FakeGraph) -> None:
     async def look_and_wait() -> None:
         await observer.observe(plan())
         graph.change()
@@ -302,7 +302,7 @@ def test_a_look_uses_up_the_changes_before_it(observer: Observer, graph: FakeGra
     run(look_and_wait())
 
 
-def test_a_burst_is_waited_out_but_not_for_ever(observer: Observer, graph: FakeGraph) -> None:
+def test_a_burst_is_waited_out_but_not_for_ever(observer: Graph, graph: FakeGraph) -> None:
     async def burst() -> tuple[float, float]:
         loop = asyncio.get_running_loop()
         await observer.observe(plan())
@@ -329,7 +329,7 @@ def test_a_burst_is_waited_out_but_not_for_ever(observer: Observer, graph: FakeG
 
 
 def test_a_transition_of_a_node_that_is_asked_wakes(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes, clients.states = managed("/a"), {"/a": "inactive"}
 
@@ -367,7 +367,7 @@ def with_parameter(made: Plan, *names: str) -> Plan:
 
 
 def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_planned(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours", "/asked", "/unplanned")
     observer.state.put_configuration(replace(configuration("/ours"), parameters=()))
@@ -381,7 +381,7 @@ def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_plann
 
 
 def test_a_parameter_that_is_waited_for_is_read_too_by_looks_at_all_and_at_its_node_alone(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/viewer")
     ready = Readiness(by=ReadyBy.PARAMETER, name="ready", value=True)
@@ -396,7 +396,7 @@ def test_a_parameter_that_is_waited_for_is_read_too_by_looks_at_all_and_at_its_n
 
 
 def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours")
     observer.state.put_configuration(replace(configuration("/ours"), parameters=()))
@@ -405,7 +405,7 @@ def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(
 
 
 def test_what_changed_while_parameters_were_read_is_seen(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
+    observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign")
 

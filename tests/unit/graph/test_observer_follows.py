@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.graph.graph import FORGET_AFTER_S, Graph
 from lifecycle.graph.loop import GraphLoop
-from lifecycle.graph.observer import FORGET_AFTER_S, Observer
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.judge import verify
@@ -39,7 +39,7 @@ class World:
         self.graph, self.clients = FakeGraph(), FakeClients()
         loop = (LoopOfItsOwn if follows else GraphLoop)(own_thread=False)
         loop.bind()
-        self.observer = Observer(self.graph, self.clients, loop)
+        self.observer = Graph(self.graph, self.clients, loop)
         self.state = self.observer.state
 
     async def show(self, *names: str) -> None:

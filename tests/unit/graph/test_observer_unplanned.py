@@ -7,14 +7,14 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.graph.observer import Observer
+from lifecycle.graph.graph import Graph
 from lifecycle.graph.status import NodeStatus
 from lifecycle.verify.observation import ObservedNode
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, observing, plan
 from tests.unit.supervisor.fakes import run
 
 
-def world() -> tuple[FakeGraph, FakeClients, Observer]:
+def world() -> tuple[FakeGraph, FakeClients, Graph]:
     graph, clients = FakeGraph(), FakeClients()
     graph.nodes = (
         ObservedNode(full_name="/guest", managed=True),

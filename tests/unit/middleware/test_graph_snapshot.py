@@ -126,6 +126,14 @@ def test_a_node_that_has_nothing_but_a_service_is_one(look: Look) -> None:
     assert (endpoint.node, endpoint.name, endpoint.gid[:24]) == ("/lamp", "/on", ONE)
 
 
+def test_services_of_an_unknown_node_are_shown_where_they_are_looked_for(look: Look) -> None:
+    unknown = "_NODE_NAME_UNKNOWN_"
+    observer = look(Graph([*server(unknown, "/on"), *server(unknown, "/off", TWO)]))
+    names = DeclaredNames(names=frozenset({(EndpointKind.SERVICE_SERVER, "/on")}))
+    (endpoint,) = observer.snapshot(names=names)[1]
+    assert (endpoint.node, endpoint.name, endpoint.gid[:24]) == ("", "/on", ONE)
+
+
 def test_a_topic_that_is_no_utf_8_is_found_and_hides_only_what_was_not_known(look: Look) -> None:
     shown = Graph([node("one"), talker(b"one", b"rt/known"), talker(b"one")])
     bad = talker(b"one", b"rt/f\xffo")

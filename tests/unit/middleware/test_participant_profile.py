@@ -1,21 +1,29 @@
-"""The profile of a participant: what it needs, added to what was there."""
+"""Profiles of Fast DDS, of participants and endpoints, and the processes that they are for."""
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.discovery import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     ParticipantSettings,
+    check_endpoint,
     default_profile,
+    discovery_environment,
+    discovery_profile,
     profile,
 )
-from lifecycle.plan.model import ParticipantConnections
+from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
+from lifecycle.network.ports import participant_ports
+from lifecycle.plan.model import ParticipantConnections, StaticEndpoint
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -198,3 +206,160 @@ def test_a_profiles_file_that_cannot_be_read_is_named(
     with pytest.raises(MiddlewareError) as refused:
         default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
     assert str(refused.value) == f"cannot read profiles {str(path)!r}: {reason}"
+
+
+_STRING = "std_msgs::msg::dds_::String_"
+
+
+def line(topic: str, user_id: int, *, writer: bool = True, **changes: bool) -> StaticEndpoint:
+    return StaticEndpoint(
+        writer=writer,
+        topic=f"rt{topic}",
+        type=_STRING,
+        profile=topic,
+        user_id=user_id,
+        **changes,
+    )
+
+
+def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
+    lines = [
+        line("/x", 1, writer=False),
+        replace(line("/x", 2), type="std_msgs::msg::dds_::Int32_"),
+        line("/y", 3),
+        line("/x", 4),
+    ]
+    check_endpoint(lines, writer=True, profile="/x", type_name=_STRING)
+    with pytest.raises(MiddlewareError):
+        check_endpoint(lines[:3], writer=True, profile="/x", type_name=_STRING)
+
+
+@pytest.mark.parametrize(
+    ("lines", "listed"),
+    [((line("/x", 1), line("/y", 2, writer=False)), f"/x ({_STRING})"), ((), "none")],
+)
+def test_an_endpoint_that_nobody_would_find_is_refused(
+    lines: tuple[StaticEndpoint, ...], listed: str
+) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        check_endpoint(lines, writer=True, profile="/y", type_name=_STRING)
+    assert str(refused.value) == (
+        f"cannot make a writer of '/y' ({_STRING}): the table of static discovery has only these "
+        f"writers for this participant: {listed}; declare the endpoint, and check or plan again"
+    )
+
+
+def connected(*urls: str, super_client: bool = False) -> ET.Element:
+    connections = ParticipantConnections(urls=urls, super_client=super_client)
+    return made(ParticipantSettings(connections=connections), domain_id=3)
+
+
+def locators(root: ET.Element, path: str) -> list[dict[str, str]]:
+    return [
+        {"kind": each.tag, **{value.tag: value.text or "" for value in each}}
+        for each in root.findall(f".//{path}/locator/*")
+    ]
+
+
+@pytest.mark.parametrize(("super_client", "protocol"), [(True, "SUPER_CLIENT"), (False, "CLIENT")])
+def test_several_servers_count_their_prefix_up(super_client: bool, protocol: str) -> None:
+    root = connected(
+        "tcpv4://10.77.0.1:5101?server=10.77.0.3:42100&server=10.77.0.4:42100",
+        super_client=super_client,
+    )
+    assert root.findtext(".//discoveryProtocol") == protocol
+    prefixes = [each.get("prefix") for each in root.findall(".//RemoteServer")]
+    assert prefixes == [f"44.53.0{n}.5f.45.50.52.4f.53.49.4d.41" for n in (0, 1)]
+
+
+def test_urls_that_one_participant_cannot_have_together_are_refused() -> None:
+    with pytest.raises(MiddlewareError, match="cannot use 'shm://' beside 'udpv4://:7911'"):
+        connected("shm://", "udpv4://:7911")
+
+
+@pytest.mark.parametrize("url", ["tcpv4://10.77.0.1:5100", "shm://"])
+def test_who_cannot_be_asked_announces_itself_each_half_second(url: str) -> None:
+    assert connected(url).findtext(".//leaseAnnouncement/nanosec") == "500000000"
+
+
+def test_who_can_be_asked_announces_itself_as_seldom_as_always() -> None:
+    root = connected("udpv4://10.77.0.1:7911?metatraffic_port=7910&multicast=off")
+    assert root.findall(".//leaseAnnouncement") == []
+
+
+def test_over_tcp_data_arrive_at_the_port_inside_a_connection_that_discovery_has() -> None:
+    """Fast DDS may lose the request for one: who is discovered is then reached by data, too."""
+    root = connected("tcpv4://10.77.0.1:5100")
+    lists = ("metatrafficUnicastLocatorList", "defaultUnicastLocatorList")
+    (discovery,), (data,) = (locators(root, each) for each in lists)
+    assert data == discovery
+    assert data["physical_port"] == "5100"
+
+
+VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+
+@pytest.mark.parametrize(
+    ("machines", "own", "environment", "expected"),
+    [
+        (["", ""], {""}, {}, True),
+        (["a", "b"], {"", "a", "b"}, {"ROS_STATIC_PEERS": ""}, True),
+        (["a", "b"], {"a"}, {}, False),
+        ([""], {""}, {"ROS_STATIC_PEERS": "10.0.2.1"}, False),
+    ],
+)
+def test_endpoints_go_by_multicast_only_where_no_other_host_is_looked_for(
+    machines: list[str], own: set[str], environment: dict[str, str], *, expected: bool
+) -> None:
+    assert all_by_multicast(machines, own, environment) is expected
+
+
+def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
+    environment = discovery_environment(tmp_path)
+    assert environment == {VARIABLE: str(tmp_path / "quick_discovery.xml")}
+    assert Path(environment[VARIABLE]).read_text(encoding="utf-8") == discovery_profile()
+    assert list(tmp_path.iterdir()) == [tmp_path / "quick_discovery.xml"]
+
+
+@pytest.mark.parametrize("variable", [VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE"])
+def test_a_users_own_profile_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
+    monkeypatch.setenv(variable, "/own.xml")
+    assert discovery_environment(tmp_path) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_users_profile_in_the_working_directory_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").touch()
+    assert discovery_environment(tmp_path) == {}
+
+
+def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MiddlewareError) as refused:
+        discovery_environment(tmp_path / "missing")
+    assert str(refused.value) == (
+        f"cannot write the discovery profile '{tmp_path}/missing/quick_discovery.xml': "
+        "No such file or directory"
+    )
+
+
+def test_only_sockets_that_receive_discovery_of_the_domain_get_more_room() -> None:
+    ports = participant_ports(231, 50)
+
+    def room(port: int) -> tuple[int, int]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+            bound.bind(("127.0.0.1", port))
+            before = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+            counted = widen_discovery_buffers(231)
+            after = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+            assert counted == (after > before)
+            return before, after
+
+    before, after = room(ports.discovery_unicast)
+    assert after > before
+    before, after = room(ports.user_unicast)
+    assert after == before

@@ -1,18 +1,25 @@
-"""Sockets of this process and what a host must have for a URL: real sockets, no DDS."""
+"""Sockets of this process: ports of URLs, DSCP, buffers, TCP connections."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import platform
 import socket
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.sockets import (
+    AT_MOST_S,
     check_free,
     check_host,
+    give_up_dead_connections,
+    is_used,
     open_sockets,
+    send_again_soon,
     sockets_here,
     udp_sockets,
 )
@@ -149,3 +156,81 @@ def test_udp_sockets_of_others_are_not_ours_and_those_of_tcp_are_neither() -> No
         assert not mine & {each.inode for each in udp_sockets(of_others=True)}
         assert port in {each.port for each in open_sockets()}
         assert other not in {each.port for each in udp_sockets()}
+
+
+_ESTABLISHED, _SYN_SENT = 1, 2  # tcp_states.h
+
+
+def _state(each: socket.socket) -> int:
+    return each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
+
+
+def test_a_connection_that_nobody_takes_is_given_up_and_one_that_lives_is_not() -> None:
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(socket.socket())
+        server.bind(("127.0.0.1", 0))
+        server.listen(0)
+        dialled = []
+        deadline = time.monotonic() + 10
+        # Once the queue of those who wait to be accepted is full, the kernel answers nobody more.
+        while not dialled or _state(dialled[-1]) != _SYN_SENT:
+            assert time.monotonic() < deadline
+            each = stack.enter_context(socket.socket())
+            each.setblocking(False)
+            each.connect_ex(server.getsockname())
+            dialled.append(each)
+        alive = [each for each in dialled if _state(each) == _ESTABLISHED]
+        assert alive
+        assert give_up_dead_connections() >= 1
+        assert _state(dialled[-1]) != _SYN_SENT
+        assert [_state(each) for each in alive] == [_ESTABLISHED] * len(alive)
+    assert give_up_dead_connections() == 0
+
+
+def test_a_connection_is_unused_if_nothing_follows_the_answer_to_its_first_request() -> None:
+    deadline = time.monotonic() + 30
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address, port = server.getsockname()
+        assert is_used(address, port) is None
+        with socket.create_connection((address, port)) as dialled:
+            taken, _ = server.accept()
+            with taken:
+                dialled.sendall(bytes(68))
+                assert is_used(address, port) is None  # the answer may be on its way
+                taken.sendall(bytes(68))
+                while is_used(address, port) is None:
+                    assert time.monotonic() < deadline
+                    time.sleep(0.01)
+                assert is_used(address, port) is False
+                dialled.sendall(bytes(38))
+                while not is_used(address, port):
+                    assert time.monotonic() < deadline
+                    time.sleep(0.01)
+
+
+_TCP_RTO_MAX_MS = 44
+KNOWN = tuple(int(each) for each in platform.release().split(".")[:2]) >= (6, 15)
+
+
+@pytest.mark.skipif(not KNOWN, reason="the kernel has no TCP_RTO_MAX_MS, see Linux 6.15")
+def test_connections_and_those_accepted_later_send_again_within_the_bound() -> None:
+    def bound_ms(each: socket.socket) -> int:
+        return each.getsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with socket.create_connection(server.getsockname()) as dialled:
+            assert bound_ms(dialled) > AT_MOST_S * 1000
+            assert send_again_soon() >= 2
+            assert bound_ms(dialled) == AT_MOST_S * 1000
+            server.accept()[0].close()
+        with socket.create_connection(server.getsockname()):
+            accepted, _ = server.accept()
+            with accepted:
+                assert bound_ms(accepted) == AT_MOST_S * 1000
+
+
+def test_other_sockets_are_left_alone() -> None:
+    of_others = send_again_soon()
+    one, other = socket.socketpair()
+    with one, other, socket.socket(socket.AF_INET, socket.SOCK_DGRAM):
+        assert send_again_soon() == of_others
