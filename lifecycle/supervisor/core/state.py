@@ -382,17 +382,9 @@ class Passage(msgspec.Struct, kw_only=True):
 
 
 class Switch(msgspec.Struct, kw_only=True):
-    """Another mode is being entered.
-
-    Attributes:
-        active: keys of the nodes that were to be active before.
-        given: names of those whose parameters are others in this mode.
-        back: the system goes back to the mode before.
-    """
+    """Another mode than `before` is being entered; `back`: as its gate or a node refused one."""
 
     before: str
-    active: frozenset[str]
-    given: tuple[str, ...] = ()
     back: bool = False
 
 
