@@ -40,16 +40,12 @@ from lifecycle.supervisor.run.options import Until
 
 def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
-    active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
-    had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch, run.to_give = Switch(before=run.mode, active=active, back=back), {}
+    run.switch, run.to_give = Switch(before=run.mode, back=back), {}
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
-        node.planned = run.plan.node(key)
-        if node.planned.expected_parameters != had[key]:
-            run.switch.given = (*run.switch.given, node.name)
-            if node.level >= Level.STARTED:
-                run.to_give[key] = None
+        was, node.planned = node.planned, run.plan.node(key)
+        if _differs(node.planned, was) and node.level >= Level.STARTED:
+            run.to_give[key] = None
     run.changed()
     return []
 
@@ -75,15 +71,16 @@ def settle_mode(run: Run) -> list[Event]:
     switch = run.switch
     if switch is None or run.to_give or run.giving or not is_settled_down(run):
         return []
-    run.switch = None
+    run.switch, before = None, in_mode(run.plan, switch.before)
+    nodes = [(each, before.node(key)) for key, each in run.nodes.items()]
     inactive = [each for each in run.plan.nodes if each.state is TargetState.INACTIVE]
     entered = ModeEntered(
         mode=run.mode,
         before=switch.before,
         inactive=tuple(each.full_name for each in inactive if each.key in run.nodes),
-        parameters=switch.given,
+        parameters=tuple(each.name for each, was in nodes if _differs(each.planned, was)),
     )
-    more = {key for key, each in run.nodes.items() if each.is_gated} - switch.active
+    more = any(each.is_gated and was.state is not TargetState.ACTIVE for each, was in nodes)
     if run.paused:
         return [entered]
     if not more:
@@ -92,6 +89,10 @@ def settle_mode(run: Run) -> list[Event]:
     until_s = run.now_s + run.timeout_s
     run.passage = Passage(until_s=until_s, mode="" if switch.back else switch.before)
     return [entered]
+
+
+def _differs(node: PlannedNode, was: PlannedNode) -> bool:
+    return node.expected_parameters != was.expected_parameters
 
 
 # Manifests

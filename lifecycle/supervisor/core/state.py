@@ -85,11 +85,8 @@ DOWNWARDS = {
 
 REACHES = {
     **{step: level for level, step in UP.items()},
+    **{step: Level(level - 1) for level, step in DOWNWARDS.items()},
     Step.WIRE: Level.CONFIGURED,
-    Step.DEACTIVATE: Level.CONNECTED,
-    Step.DISCONNECT: Level.CONFIGURED,
-    Step.CLEANUP: Level.STARTED,
-    Step.SHUTDOWN: Level.DOWN,
     Step.UNLOAD: Level.DOWN,
 }
 """Where a managed node is after a step."""
@@ -382,17 +379,9 @@ class Passage(msgspec.Struct, kw_only=True):
 
 
 class Switch(msgspec.Struct, kw_only=True):
-    """Another mode is being entered.
-
-    Attributes:
-        active: keys of the nodes that were to be active before.
-        given: names of those whose parameters are others in this mode.
-        back: the system goes back to the mode before.
-    """
+    """Another mode than `before` is being entered; `back`: as its gate or a node refused one."""
 
     before: str
-    active: frozenset[str]
-    given: tuple[str, ...] = ()
     back: bool = False
 
 
@@ -572,7 +561,7 @@ class Run(msgspec.Struct, kw_only=True):
         """Whether it has ended and nothing of it runs."""
         return (
             self.ending is not None
-            and all(each.state is None and not each.sweeping for each in self.processes.values())
+            and all(each.state is None for each in self.processes.values())
             and all(
                 each.level <= each.base or each.stuck or each.silent or self.hurry
                 for each in self.nodes.values()

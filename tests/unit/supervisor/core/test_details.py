@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 
-import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
@@ -96,16 +95,6 @@ def test_what_a_node_shows_is_a_change_of_the_system() -> None:
     mark = play.run.mark
     play.give(messages.Saw(shown={"camera": frozenset({"publishes image"})}))
     assert play.run.mark == mark
-
-
-@pytest.mark.parametrize("times", [1, 2, 3])
-def test_a_node_that_others_activate_is_deactivated_and_after_three_times_left(times: int) -> None:
-    play = Play(plan_of(planned_node("arm", managed=True, kind=RunKind.COMMAND)))
-    play.order(ControlRequest.PAUSE)
-    assert play.levels == str(int(Level.CONNECTED))
-    for _ in range(times):
-        play.give(messages.Saw(levels={"arm": Level.ACTIVE}))
-    assert play.story.count("arm deactivate") == 1 + min(times, 3)
 
 
 def test_a_paused_system_that_is_taken_through_its_gate_in_vain_is_paused_still() -> None:

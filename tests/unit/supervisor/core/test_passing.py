@@ -10,9 +10,9 @@ from lifecycle.manifest.model import Condition, Discovery, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.failure import ALSO_S
-from lifecycle.supervisor.run.events import Failure, Notice
+from lifecycle.supervisor.run.events import Failure, Notice, RestartScheduled
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.core.playbook import CHAIN, GONE, INTRUDER, Play
+from tests.unit.supervisor.core.playbook import CHAIN, GONE, INTRUDER, Play, chain
 from tests.unit.supervisor.session_world import DIALLING
 
 CHANGED = "the system changed before every node was activated"
@@ -207,6 +207,19 @@ def test_what_became_active_is_judged_again_and_must_be_what_was_verified() -> N
     play.wait(1.0)
     why = f"what became active is not what was verified; wrong: {STRANGER}"
     assert (play.code, play.reason) == (4, why)
+
+
+def test_who_comes_again_and_is_not_what_was_verified_once_it_is_active_has_failed_again() -> None:
+    play = Play(chain())
+    play.ways["camera activate"] = "hang"
+    play.die("camera")
+    play.wait(1.0)
+    play.see(INTRUDER)
+    play.finish("camera activate")
+    play.wait(1.0)
+    text = "cannot keep '/camera' active: what became active is not what was verified; wrong: {}"
+    assert play.failures[-1] == ("/camera", text.format(STRANGER))
+    assert [each.restarts for each in play.heard(RestartScheduled)] == [0, 1]
 
 
 # Orders
