@@ -28,12 +28,10 @@ BY_POLICY = frozenset({"check.unheard", "check.unpublished", "check.no-server"})
 
 
 class Position(msgspec.Struct, frozen=True, kw_only=True):
-    """A place in a document.
+    """A place in a document; lines and columns count from 1.
 
     Attributes:
         file: path as the user wrote it.
-        line: from 1.
-        column: from 1.
         path: place in the document, `nodes.camera.interface.publishers[0].qos.depth`.
     """
 

@@ -1,8 +1,7 @@
 """DSCP (differentiated services code point): names, numbers, TOS byte, TRANSPORT_PRIORITY mapping.
 
 Owns: every spelling of a DSCP that a user may write or read; TRANSPORT_PRIORITY → TOS byte as RTI
-Connext Micro computes it (*Connext Micro, Transport Priority*, "Using transport priority with
-UDP"), for systems that number so, and what that mapping silently loses. Pure.
+Connext Micro computes it (*Connext Micro, Transport Priority*), and what that silently loses. Pure.
 
 A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
 two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both

@@ -1,13 +1,10 @@
 """Transports between participants: UDP, TCP, shared memory, multicast; size of a UDP datagram.
 
-Owns: the one enum of media, with what others ask of each; `FlowTransport`, the values of a
-manifest's `transport:`; MTU, and what of a datagram IP fragments. Which medium two ends get, and
-why, is in `plan.media`. Pure.
-
-A UDP datagram that does not fit the path's MTU is split by IP. Only the first fragment carries the
-ports, so that a rule on ports treats the others as something else, and one lost fragment loses them
-all (RFC 8085, section 3.2). RTPS can split a message itself (DATA_FRAG): then each part is a
-datagram of its own, with ports.
+Owns: the one enum of media; `FlowTransport`, the values of a manifest's `transport:`; MTU, and what
+of a datagram IP fragments. Only the first fragment carries the ports, so that a rule on ports
+treats the others as something else, and one lost fragment loses them all (RFC 8085, section 3.2).
+RTPS can split a message itself (DATA_FRAG): then each part is a datagram of its own, with ports.
+Which medium two ends get, and why, is in `plan.negotiation.media`. Pure.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
 """Network flow endpoints (NFEs), flow tuples, uniqueness, as *Unique Network Flows* defines them.
 
-Owns: the NFE tuple, the requirement enum, when two NFEs are dissimilar and a flow is as unique as
-demanded; which NFEs of a publisher (source) and a subscription (destination) form a flow: a
-5-tuple, on IPv6 a flow label beside it, and the DSCP; addresses as text: one spelling each, by the
-scope rules of RFC 4007 and RFC 6890. Pure.
+Owns: the NFE tuple, the requirement enum, when two NFEs are dissimilar; which NFEs of a publisher
+(source) and a subscription (destination) form a flow: a 5-tuple, on IPv6 a flow label beside it,
+and the DSCP; addresses as text: one spelling each, by the scope rules of RFC 4007 and RFC 6890.
 
 The article defines uniqueness for one NFE. An endpoint usually has several, and the middleware
 chooses per packet. Here an endpoint is unique when *every* IP NFE of it is dissimilar to every NFE
-of every other endpoint, as in the article's getter example: one shared NFE (a multicast group, say)
-is a path on which the network cannot distinguish the endpoints. Publishers (sources of flows) are
-compared with publishers, subscriptions (destinations) with subscriptions.
+of every other endpoint: one shared NFE (a multicast group, say) is a path on which the network
+cannot distinguish the endpoints. Publishers are compared with publishers, subscriptions with
+subscriptions. Pure.
 """
 
 from __future__ import annotations
@@ -120,11 +119,7 @@ _VERSIONS = {InternetProtocol.IPV4: "v4", InternetProtocol.IPV6: "v6"}
 
 
 class UniqueRequirement(enum.Enum):
-    """`require_unique_network_flow_endpoints`: a creation-time option of every endpoint.
-
-    Values are spelled as in the manifest; `rmw_value` is the number in
-    rmw_unique_network_flow_endpoints_requirement_t.
-    """
+    """`require_unique_network_flow_endpoints`: a creation-time option of every endpoint."""
 
     NOT_REQUIRED = "not_required"
     STRICTLY_REQUIRED = "strictly_required"
@@ -146,13 +141,12 @@ class NetworkFlowEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """The part of a network flow that belongs to one publisher or subscription.
 
     Field names are those of rmw_network_flow_endpoint_t. Equality is the article's "not
-    dissimilar": two NFEs are dissimilar if one or more of their networking resources differ.
-    `dissimilar` adds what textual equality cannot know: wildcards and other spellings.
+    dissimilar"; `dissimilar` adds what textual equality cannot know: wildcards and other spellings.
 
     Attributes:
-        transport_port: 0–65535; 0 where the transport has none.
-        flow_label: IPv6 flow label, 0–0xFFFFF, publishers only.
-        dscp: 0–63, publishers only.
+        transport_port: 0 where the transport has none.
+        flow_label: IPv6 flow label, publishers only.
+        dscp: publishers only.
         internet_address: textual address, empty for shared memory.
     """
 
@@ -234,12 +228,9 @@ class FlowTuple(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         source_address: `0.0.0.0` or `::` where the sender's routing decides per packet.
-        source_port: 0–65535.
         destination_address: unicast, or a group.
-        destination_port: 0–65535.
-        flow_label: IPv6 flow label, 0–0xFFFFF; 0 if the sender sets none (RFC 6437 §2), which
-            leaves it to the kernel and to rules on the way.
-        dscp: 0–63.
+        flow_label: IPv6 flow label; 0 if the sender sets none (RFC 6437 §2), which leaves it to the
+            kernel and to rules on the way.
     """
 
     transport_protocol: TransportProtocol

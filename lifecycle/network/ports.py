@@ -1,11 +1,9 @@
 """DDS port arithmetic: UDP ports of a domain and participant, and how many participants fit a host.
 
-Owns: the formula of DDSI-RTPS §9.6.2.3 with its default constants, the platforms' ephemeral port
-ranges, the limits that follow (the article *The ROS_DOMAIN_ID*), and the judgement whether so many
-participants and unique subscriptions fit on one host, with a message where they do not. Pure.
-
-These are the ports a participant asks for. A busy one is replaced by the implementation, so the
-ports of a running system are read from it, never inferred from here.
+Owns: the formula of DDSI-RTPS §9.6.2.3 with its default constants, Linux's ephemeral ports, the
+limits that follow (the article *The ROS_DOMAIN_ID*), and the judgement whether so many participants
+and unique subscriptions fit on one host. These are the ports a participant asks for; a busy one is
+replaced, so the ports of a running system are read from it. Pure.
 """
 
 from __future__ import annotations

@@ -45,12 +45,10 @@ def spell_place(place: Sequence[str | int]) -> str:
 
 
 class Value(msgspec.Struct, frozen=True, kw_only=True):
-    """One value of a document.
+    """One value of a document; lines and columns count from 1.
 
     Attributes:
         data: the scalar, or the items of a sequence, or the entries of a mapping.
-        line: from 1.
-        column: from 1.
         key: line and column of the key that names it in a mapping; None elsewhere.
         text: a scalar as written, without its quotes.
         quoted: the scalar was in quotes or was a block scalar: it is a string whatever it holds.
