@@ -15,7 +15,6 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
-from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -207,22 +206,20 @@ def _conflicts(view: View) -> Iterator[Finding]:
     for actual in view.actual:
         types.setdefault((actual.kind.meets_in, actual.name), {})[actual.planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
-    undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
+    undeclared = (
         *(each for each in view.seen if each.planned is None),
-        *(each for each in others if not each.kind.is_topic),
+        *(SeenEndpoint.of(each) for each in others if not each.kind.is_topic),
     )
     for seen in undeclared:
         what = seen.kind.meets_in
         declared = types.get((what, seen.name))
         if declared is None or seen.type in declared:
             continue
-        word = seen.kind.noun
-        who = seen.node or "an unknown node"
         yield TYPE_MISMATCH.finding(
             subject=seen.name,
             expected=" or ".join(declared),
             observed=seen.type or "no type",
-            message=f"the {word} of {seen.name} in {who} matches none: it is"
+            message=f"{seen.where} matches none: it is"
             f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
             f" {' or '.join(declared)}",
             node=seen.node,
@@ -258,7 +255,10 @@ _Place = tuple[str, str, str]
 
 def _definitions(view: View) -> Iterator[Finding]:
     """Compare the ends of everything that is declared, with what is installed or each other."""
-    installed = {_place(each.planned): each.planned.type_hash for each in view.actual}
+    installed = {
+        (each.kind.meets_in, each.name, each.planned.type): each.planned.type_hash
+        for each in view.actual
+    }
     unknown: dict[str, list[SeenEndpoint]] = {}
     differing: dict[Finding, None] = {}
     for place, ends in _ends(view).items():
@@ -311,9 +311,8 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _place(end: SeenEndpoint | PlannedEndpoint) -> _Place:
-    name = end.resolved if isinstance(end, PlannedEndpoint) else end.name
-    return end.kind.meets_in, name, end.type
+def _place(end: SeenEndpoint) -> _Place:
+    return end.kind.meets_in, end.name, end.type
 
 
 def _at(end: SeenEndpoint) -> Position | None:
