@@ -33,7 +33,6 @@ from lifecycle.plan.discovery import (
     PortPool,
     connect_control,
     connect_observers,
-    is_fixed,
     meshed,
     with_tcp,
 )
@@ -149,7 +148,8 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     discovery, data_layer = plan.discovery, plan.data_layer
     hosts = Hosts.of(plan)
     pool = PortPool(discovery.first_port, written_ports(plan, hosts))
-    nodes, control = connect_control(plan.nodes, discovery, hosts, pool)
+    plan, own = connect_control(plan, hosts, pool)
+    nodes = plan.nodes
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
         nodes = place_static(nodes, hosts, pool)
     # A node that can join at any time must announce it where others work out connections from it.
@@ -168,10 +168,9 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        server=control.server,
-        observers=_by_machine(with_tcp(control, hosts), hosts),
+        observers=_by_machine(with_tcp(own, hosts), hosts),
     )
-    variables = dict(variables_of(discovery, control.server))
+    variables = dict(variables_of(discovery, plan.server))
     parties = {
         node.key: party_of_node(node, hosts, rmw=rmw_of(node, plan), variables=variables)
         for node in nodes
@@ -185,13 +184,8 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     found += infeasible(plan.nodes, parties, negotiated=static)
     if found:
         raise PlanError.of(tuple(found))
-    observers = connect_observers(
-        plan.nodes,
-        hosts,
-        control,
-        fixed=is_fixed(discovery),
-        may_use_tcp=not static and _may_use_tcp(plan),
-    )
+    may_use_tcp = not static and _may_use_tcp(plan)
+    observers = connect_observers(plan, hosts, own, may_use_tcp=may_use_tcp)
     return replace(plan, observers=_by_machine(observers, hosts))
 
 
