@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     DataLayerSource,
-    Discovery,
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
@@ -26,7 +25,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.manifest.yaml.document import error
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import TRANSPORTS_VARIABLE, medium_of, udp_to
+from lifecycle.network.medium import medium_of, udp_to
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.discovery import (
     Hosts,
@@ -48,7 +47,6 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
     PlannedParticipant,
-    PlannedServer,
     StaticEndpoint,
     StaticParticipant,
 )
@@ -65,6 +63,7 @@ from lifecycle.plan.parties import (
     wishes_of,
     written_ports,
 )
+from lifecycle.plan.processes import variables_of
 from lifecycle.printable import count
 
 _End = tuple[PlannedNode, PlannedEndpoint]
@@ -170,7 +169,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
         nodes=nodes,
         observers=_by_machine(with_tcp(own, hosts), hosts),
     )
-    variables = dict(variables_of(discovery, plan.server))
+    variables = dict(variables_of(plan))
     parties = {
         node.key: party_of_node(node, hosts, rmw=rmw_of(node, plan), variables=variables)
         for node in nodes
@@ -206,24 +205,6 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
             for flow in plan.flows
         ),
     )
-
-
-def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tuple[str, str], ...]:
-    """Return what connects a process whose participant is its own code's to the control plane.
-
-    Only what Fast DDS 2.14 reads from the environment: transports and a discovery server. With
-    FASTDDS_BUILTIN_TRANSPORTS other than NONE beside a server, every sample would arrive twice.
-    """
-    if server is not None:
-        at = f"{server.address}:{server.port}"
-        if server.tcp:
-            return (
-                ("ROS_DISCOVERY_SERVER", f"TCPv4:[{server.address}]:{server.port}"),
-                (TRANSPORTS_VARIABLE, "NONE"),
-            )
-        return (("ROS_DISCOVERY_SERVER", at), (TRANSPORTS_VARIABLE, "UDPv4"))
-    value = discovery.transport.builtin
-    return ((TRANSPORTS_VARIABLE, value),) if value else ()
 
 
 def _by_machine(
