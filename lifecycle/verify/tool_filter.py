@@ -465,8 +465,10 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
                     type_hash=_action_hash(goal, result, feedback),
                 )
             )
-        folded = [each for found in (named if calls and whole else whole) for each in found]
-        kept.extend(each for each in parts if each not in folded)
+        for found in named if calls and whole else whole:
+            for each in found:
+                parts.remove(each)
+        kept.extend(parts)
     return tuple(kept)
 
 
