@@ -105,7 +105,8 @@ class Uniqueness:
             for report in configuration.endpoints:
                 if report.kind.is_topic and not report.error:
                     entry = _entry(configuration, report, address)
-                    self._entries[_place(configuration.name, report)] = entry
+                    # Of several reports of one name the first counts.
+                    self._entries.setdefault(_place(configuration.name, report), entry)
                     if entry.judged is None:
                         self._unknown.add((entry.kind, entry.process))
                     for each in {*(entry.judged or ())}:
