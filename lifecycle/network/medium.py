@@ -4,7 +4,7 @@ Owns: the one enum of media; `FlowTransport`, the values of a manifest's `transp
 of a datagram IP fragments. Only the first fragment carries the ports, so that a rule on ports
 treats the others as something else, and one lost fragment loses them all (RFC 8085, section 3.2).
 RTPS can split a message itself (DATA_FRAG): then each part is a datagram of its own, with ports.
-Which medium two ends get, and why, is in `plan.negotiation.media`. Pure.
+Which medium two ends get, and why, is in `plan.media`. Pure.
 """
 
 from __future__ import annotations

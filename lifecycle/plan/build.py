@@ -58,7 +58,7 @@ from lifecycle.plan.model import (
 from lifecycle.plan.parameters import NodeParameters, portable
 from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
-from lifecycle.plan.wiring import variables_of, wire
+from lifecycle.plan.wiring import wire
 from lifecycle.printable import listed
 
 
@@ -159,18 +159,10 @@ def build_plan(
     discovery_range = effective_range(manifest.discovery, variables)
     parameters = NodeParameters(ParameterFiles(manifest.path), manifest.modes)
     plan = _wired(manifest, variables, parameters)
-    processes = planned_processes(
-        manifest.nodes,
-        domain_id=plan.domain_id,
-        discovery_range=discovery_range,
-        environment=variables,
-        connecting=variables_of(manifest.discovery, plan.server),
-        shared_memory=manifest.discovery.transport.in_memory,
-    )
+    plan = replace(plan, discovery_range=discovery_range)
     plan = replace(
         plan,
-        discovery_range=discovery_range,
-        processes=processes,
+        processes=planned_processes(manifest.nodes, plan, variables),
         levels=dependency_levels(manifest.nodes),
     )
     return in_mode(plan, plan.modes[0].name) if plan.modes else plan

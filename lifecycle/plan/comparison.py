@@ -360,10 +360,8 @@ def decode(text: str) -> PlanNotice:
     Raises:
         PlanNoticeError: it is none, longer than 1 MiB, or not fit to be shown.
     """
-    if len(text) > MAX_TEXT:
-        raise PlanNoticeError(f"cannot read a notice of {len(text)} characters: allowed {MAX_TEXT}")
     try:
-        notice = from_json(text, PlanNotice)
+        notice = from_json(text, PlanNotice, longest=MAX_TEXT)
     except ValueError as error:
         raise PlanNoticeError(f"cannot read a plan notice: {error}") from error
     # They are shown to people as they are.

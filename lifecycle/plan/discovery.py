@@ -256,21 +256,17 @@ def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
     return hosts
 
 
-class Control(msgspec.Struct, frozen=True, kw_only=True):
-    """The control plane of a system.
+class Observers(msgspec.Struct, frozen=True, kw_only=True):
+    """Supervisors' own participants, by host.
 
     Attributes:
-        transport: of own participants; ANY leaves it to the RMW.
-        server: the discovery server, if there is one.
-        observers: by host, how its observer is connected so far.
-        observer_ports: by host, given out to its observer where it needs them: metatraffic, user
-            data and source port of UDP, and a listening port of TCP.
+        connections: as they are on the control plane.
+        ports: given out to each where it needs them: metatraffic, user data and source port of UDP,
+            and a listening port of TCP.
     """
 
-    transport: FlowTransport
-    server: PlannedServer | None = None
-    observers: Mapping[str, ParticipantConnections]
-    observer_ports: Mapping[str, tuple[int, ...]]
+    connections: Mapping[str, ParticipantConnections]
+    ports: Mapping[str, tuple[int, ...]]
 
 
 _Slot = tuple[str, str, str]
@@ -297,10 +293,8 @@ def is_fixed(discovery: Discovery) -> bool:
     return discovery.mode in (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
-def connect_control(
-    nodes: Sequence[PlannedNode], discovery: Discovery, hosts: Hosts, pool: PortPool
-) -> tuple[tuple[PlannedNode, ...], Control]:
-    """Connect own participants, extra ones without connection, and observers.
+def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Observers]:
+    """Connect own participants, extra ones without connection, observers and a discovery server.
 
     A participant of a declared connection has its URLs already and is left alone, and so are all
     extra ones where endpoints are static: they carry data and become connections (`place_static`).
@@ -308,8 +302,8 @@ def connect_control(
     Raises:
         PlanError: a host has no address, or too few ports.
     """
+    discovery, server = plan.discovery, None
     transport = control_transport(discovery, hosts)
-    server = None
     if discovery.mode is DiscoveryMode.SERVER:
         tcp = transport.medium is not None and transport.medium.is_tcp
         at = hosts.host(hosts.server)
@@ -317,14 +311,9 @@ def connect_control(
             machine=hosts.server, address=hosts.address(at), port=pool.take(at)[0], tcp=tcp
         )
     ports = {host: pool.take(host, 4) for host in hosts.used}
-    control = Control(
-        transport=transport,
-        server=server,
-        observers=dict.fromkeys(hosts.used, ParticipantConnections()),
-        observer_ports=ports,
-    )
     if transport is FlowTransport.ANY:
-        return tuple(nodes), control
+        none = dict.fromkeys(hosts.used, ParticipantConnections())
+        return plan, Observers(connections=none, ports=ports)
     (kind,) = transport.media
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and kind.is_network
     extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
@@ -332,7 +321,7 @@ def connect_control(
         ("observer", host, ""): (host, taken[3:] if kind.is_tcp else taken[:3])
         for host, taken in ports.items()
     }
-    ours = [node for node in nodes if node.run.kind is RunKind.PYTHON]
+    ours = [node for node in plan.nodes if node.run.kind is RunKind.PYTHON]
     wanted = [(("process", node.process, ""), node.machine) for node in ours]
     wanted += [
         (("extra", node.key, each.name), node.machine)
@@ -358,7 +347,7 @@ def connect_control(
             return each
         return replace(each, transports=(), connections=connected(slot))
 
-    return tuple(
+    nodes = tuple(
         replace(
             node,
             transports=(),  # the URLs say so
@@ -367,8 +356,12 @@ def connect_control(
         )
         if node.run.kind is RunKind.PYTHON
         else node
-        for node in nodes
-    ), replace(control, observers={host: connected(("observer", host, "")) for host in hosts.used})
+        for node in plan.nodes
+    )
+    connections = {host: connected(("observer", host, "")) for host in hosts.used}
+    return replace(plan, nodes=nodes, server=server), Observers(
+        connections=connections, ports=ports
+    )
 
 
 _Key = TypeVar("_Key")
@@ -410,34 +403,24 @@ def meshed(
     return found
 
 
-def with_tcp(control: Control, hosts: Hosts) -> dict[str, ParticipantConnections]:
+def with_tcp(observers: Observers, hosts: Hosts) -> dict[str, ParticipantConnections]:
     """Return the observers as they are if they must also be found by TCP, by host."""
     return {
-        host: replace(each, urls=tuple(map(str, _with_tcp(each, control, host, hosts))))
-        for host, each in control.observers.items()
+        host: replace(each, urls=tuple(map(str, _with_tcp(each, observers, host, hosts))))
+        for host, each in observers.connections.items()
     }
 
 
 def connect_observers(
-    nodes: Sequence[PlannedNode],
-    hosts: Hosts,
-    control: Control,
-    *,
-    fixed: bool,
-    may_use_tcp: bool = False,
+    plan: Plan, hosts: Hosts, observers: Observers, *, may_use_tcp: bool
 ) -> dict[str, ParticipantConnections]:
     """Return how the observer of each host is connected; nothing where the RMW may connect it.
 
-    Args:
-        nodes: with all their connections.
-        hosts: of the system.
-        control: what own participants have.
-        fixed: nothing is found by multicast.
-        may_use_tcp: connections that are not planned may use TCP.
+    The nodes have all their connections; `may_use_tcp`: those that are not planned may use TCP.
     """
     urls = [
         (hosts.host(node.machine), parse(text))
-        for node in nodes
+        for node in plan.nodes
         for each in node.participants
         if each.connection and not each.connections.static_participants
         for text in each.connections.urls
@@ -445,12 +428,12 @@ def connect_observers(
     kinds = {url.transport.unicast for _, url in urls if url.transport.is_network}
     if may_use_tcp:
         kinds.add(DEFAULT_TCP)
-    if fixed:
+    if is_fixed(plan.discovery):
         kinds = {each for each in kinds if each.is_tcp}
     # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
         contact.peer
-        for host, each in with_tcp(control, hosts).items()
+        for host, each in with_tcp(observers, hosts).items()
         for contact in contacts_of(host, each.urls)
     }
     contacts = [
@@ -466,7 +449,7 @@ def connect_observers(
         found = _base_urls(base)
         needed = kinds - {url.transport.unicast for url in found if url.transport.is_network}
         if any(each.is_tcp for each in needed):
-            found = _with_tcp(base, control, host, hosts)
+            found = _with_tcp(base, observers, host, hosts)
         found += [ConnectionUrl(transport=kind) for kind in UDP_UNICAST if kind in needed]
         new = [{*peers_by(url.transport, wanted, host=host)} - {*url.peers} for url in found]
         if not needed and not any(new):
@@ -479,10 +462,10 @@ def connect_observers(
             ),
         )
 
-    observers = control.observers
-    if control.server is None:  # else it announces everything to them
-        observers = {host: connected(host, base) for host, base in observers.items()}
-    return {host: each for host, each in observers.items() if each.urls}
+    found = observers.connections
+    if plan.server is None:  # else it announces everything to them
+        found = {host: connected(host, base) for host, base in found.items()}
+    return {host: each for host, each in found.items() if each.urls}
 
 
 def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
@@ -493,12 +476,12 @@ def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
 
 
 def _with_tcp(
-    base: ParticipantConnections, control: Control, host: str, hosts: Hosts
+    base: ParticipantConnections, observers: Observers, host: str, hosts: Hosts
 ) -> list[ConnectionUrl]:
     urls = _base_urls(base)
-    if control.transport.medium and control.transport.medium.is_tcp:
+    if any(each.transport.is_tcp for each in urls):
         return urls
     # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
     address = LOOPBACK if ":" in host else hosts.address(host) if host or not hosts.several else ""
-    port = control.observer_ports[host][3]
+    port = observers.ports[host][3]
     return [*urls, ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port)]

@@ -25,32 +25,40 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
+from lifecycle.network.medium import TRANSPORTS_VARIABLE
 from lifecycle.plan.model import Plan, PlanError, PlannedProcess
 
 
+def variables_of(plan: Plan) -> tuple[tuple[str, str], ...]:
+    """Return what connects a process whose participant is its own code's to the control plane.
+
+    Only what Fast DDS 2.14 reads from the environment: transports and a discovery server. With
+    FASTDDS_BUILTIN_TRANSPORTS other than NONE beside a server, every sample would arrive twice.
+    """
+    server = plan.server
+    if server is not None:
+        at = f"{server.address}:{server.port}"
+        if server.tcp:
+            return (
+                ("ROS_DISCOVERY_SERVER", f"TCPv4:[{server.address}]:{server.port}"),
+                (TRANSPORTS_VARIABLE, "NONE"),
+            )
+        return (("ROS_DISCOVERY_SERVER", at), (TRANSPORTS_VARIABLE, "UDPv4"))
+    value = plan.discovery.transport.builtin
+    return ((TRANSPORTS_VARIABLE, value),) if value else ()
+
+
 def planned_processes(
-    nodes: Sequence[Node],
-    *,
-    domain_id: int,
-    discovery_range: DiscoveryRange,
-    environment: Mapping[str, str],
-    connecting: Sequence[tuple[str, str]] = (),
-    shared_memory: bool = False,
+    nodes: Sequence[Node], plan: Plan, environment: Mapping[str, str]
 ) -> tuple[PlannedProcess, ...]:
     """Group nodes by process, in the order in which the manifest first names each process.
 
-    Args:
-        nodes: in manifest order.
-        domain_id: given to every process.
-        discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
-            that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
-            127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.
-        environment: where AMENT_PREFIX_PATH is looked up.
-        connecting: variables that connect commands, whose participants are their own code's.
-        shared_memory: own participants have nothing else.
+    Commands that have shared memory alone are not given the range LOCALHOST: rmw_fastrtps_cpp 8.4
+    would have them look for peers at 127.0.0.1 only, where no peer is, and shared memory stays on
+    this host anyway.
 
     Raises:
-        PlanError: an executable cannot be found.
+        PlanError: an executable cannot be found in this environment.
     """
     groups: dict[str, list[Node]] = {}
     for node in nodes:
@@ -59,8 +67,9 @@ def planned_processes(
     def process(name: str, group: Sequence[Node]) -> PlannedProcess:
         run = group[0].run
         is_command = run.kind is RunKind.COMMAND
-        near = is_command and shared_memory and discovery_range is DiscoveryRange.LOCALHOST
-        reach = DiscoveryRange.SYSTEM_DEFAULT if near else discovery_range
+        reach = plan.discovery_range
+        if is_command and reach is DiscoveryRange.LOCALHOST and plan.discovery.transport.in_memory:
+            reach = DiscoveryRange.SYSTEM_DEFAULT
         return PlannedProcess(
             name=name,
             machine=group[0].machine,
@@ -69,8 +78,8 @@ def planned_processes(
             argv=(*run.prefix, *command_line(group, environment)) if is_command else (),
             environment=tuple(
                 {
-                    **(dict(connecting) if is_command else {}),
-                    "ROS_DOMAIN_ID": str(domain_id),
+                    **(dict(variables_of(plan)) if is_command else {}),
+                    "ROS_DOMAIN_ID": str(plan.domain_id),
                     "ROS_AUTOMATIC_DISCOVERY_RANGE": reach.name,
                     **dict(run.environment),
                 }.items()

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error
 from lifecycle.manifest.model import (
     DataLayerSource,
-    Discovery,
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
@@ -25,14 +24,13 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import TRANSPORTS_VARIABLE, medium_of, udp_to
+from lifecycle.network.medium import medium_of, udp_to
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.discovery import (
     Hosts,
     PortPool,
     connect_control,
     connect_observers,
-    is_fixed,
     meshed,
     with_tcp,
 )
@@ -48,7 +46,6 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
     PlannedParticipant,
-    PlannedServer,
     StaticEndpoint,
     StaticParticipant,
 )
@@ -65,6 +62,7 @@ from lifecycle.plan.parties import (
     wishes_of,
     written_ports,
 )
+from lifecycle.plan.processes import variables_of
 from lifecycle.printable import count
 
 _End = tuple[PlannedNode, PlannedEndpoint]
@@ -148,7 +146,8 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     discovery, data_layer = plan.discovery, plan.data_layer
     hosts = Hosts.of(plan)
     pool = PortPool(discovery.first_port, written_ports(plan, hosts))
-    nodes, control = connect_control(plan.nodes, discovery, hosts, pool)
+    plan, own = connect_control(plan, hosts, pool)
+    nodes = plan.nodes
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
         nodes = place_static(nodes, hosts, pool)
     # A node that can join at any time must announce it where others work out connections from it.
@@ -167,10 +166,9 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        server=control.server,
-        observers=_by_machine(with_tcp(control, hosts), hosts),
+        observers=_by_machine(with_tcp(own, hosts), hosts),
     )
-    variables = dict(variables_of(discovery, control.server))
+    variables = dict(variables_of(plan))
     parties = {
         node.key: party_of_node(node, hosts, rmw=rmw_of(node, plan), variables=variables)
         for node in nodes
@@ -184,13 +182,8 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     found += infeasible(plan.nodes, parties, negotiated=static)
     if found:
         raise PlanError.of(tuple(found))
-    observers = connect_observers(
-        plan.nodes,
-        hosts,
-        control,
-        fixed=is_fixed(discovery),
-        may_use_tcp=not static and _may_use_tcp(plan),
-    )
+    may_use_tcp = not static and _may_use_tcp(plan)
+    observers = connect_observers(plan, hosts, own, may_use_tcp=may_use_tcp)
     return replace(plan, observers=_by_machine(observers, hosts))
 
 
@@ -211,24 +204,6 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
             for flow in plan.flows
         ),
     )
-
-
-def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tuple[str, str], ...]:
-    """Return what connects a process whose participant is its own code's to the control plane.
-
-    Only what Fast DDS 2.14 reads from the environment: transports and a discovery server. With
-    FASTDDS_BUILTIN_TRANSPORTS other than NONE beside a server, every sample would arrive twice.
-    """
-    if server is not None:
-        at = f"{server.address}:{server.port}"
-        if server.tcp:
-            return (
-                ("ROS_DISCOVERY_SERVER", f"TCPv4:[{server.address}]:{server.port}"),
-                (TRANSPORTS_VARIABLE, "NONE"),
-            )
-        return (("ROS_DISCOVERY_SERVER", at), (TRANSPORTS_VARIABLE, "UDPv4"))
-    value = discovery.transport.builtin
-    return ((TRANSPORTS_VARIABLE, value),) if value else ()
 
 
 def _by_machine(

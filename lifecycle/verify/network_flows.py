@@ -15,6 +15,7 @@ as multicast.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -40,9 +41,6 @@ from lifecycle.verify.observation import EndpointReport, Identity, NodeConfigura
 
 if TYPE_CHECKING:
     from lifecycle.verify.view import Actual, FlowView
-
-_SEVERAL = -1
-"""Instead of the one endpoint that has an NFE."""
 
 _Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
 
@@ -76,6 +74,13 @@ def _entry(configuration: NodeConfiguration, report: EndpointReport, address: st
     )
 
 
+_Place = tuple[str, EndpointKind, str, str, str]
+
+
+def _place(node: str, report: EndpointReport) -> _Place:
+    return node, report.kind, report.name, report.resolved, report.gid
+
+
 class Uniqueness:
     """Answers for every reported endpoint whether it is unique.
 
@@ -89,56 +94,46 @@ class Uniqueness:
         configurations: Iterable[NodeConfiguration],
         addresses: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self._configurations = tuple(configurations)
-        """Kept, so that the identities of its reports stay theirs: equal ones may be of two."""
-        self._entries: dict[int, _Entry] = {}
+        self._entries: dict[_Place, _Entry] = {}
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
         # of one bucket are ever compared: judging grows with the endpoints, not with their square.
-        # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
-        self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
+        # Endpoints of one participant have the same NFEs, so each is kept once, with how many.
+        self._buckets: dict[_Bucket, Counter[LocatedNfe]] = {}
         self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
-        for configuration in self._configurations:
+        for configuration in configurations:
             address = addresses.get(configuration.name, "")
             for report in configuration.endpoints:
                 if report.kind.is_topic and not report.error:
-                    entry = self._entries[id(report)] = _entry(configuration, report, address)
-                    self._add(entry)
+                    entry = _entry(configuration, report, address)
+                    # Of several reports of one name the first counts.
+                    self._entries.setdefault(_place(configuration.name, report), entry)
+                    if entry.judged is None:
+                        self._unknown.add((entry.kind, entry.process))
+                    for each in {*(entry.judged or ())}:
+                        self._buckets.setdefault(_bucket(entry.kind, each), Counter())[each] += 1
         self._answers = {each: self._judge(entry) for each, entry in self._entries.items()}
-
-    def _add(self, entry: _Entry) -> None:
-        if entry.judged is None:
-            self._unknown.add((entry.kind, entry.process))
-            return
-        for each in entry.judged:
-            if is_ip(each.nfe):
-                owners = self._buckets.setdefault(_bucket(entry.kind, each), {})
-                if owners.setdefault(each, id(entry)) != id(entry):
-                    owners[each] = _SEVERAL
 
     def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
-        entries = (self._entries.get(id(end.report)) for end in ends)
-        found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
-        return tuple(dict.fromkeys(found))
+        places = (_place(end.node, end.report) for end in ends if end.report)
+        entries = (self._entries[each] for each in places if each in self._entries)
+        return tuple(dict.fromkeys(each.nfe for entry in entries for each in entry.nfes or ()))
 
     def is_unique(self, end: Actual) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
-        return self._answers.get(id(end.report))
+        return self._answers.get(_place(end.node, end.report)) if end.report else None
 
     def _judge(self, entry: _Entry) -> bool | None:
         if entry.judged is None:
             return None
-        kind, me = entry.kind, id(entry)
         own = [each for each in entry.judged if is_ip(each.nfe)]
         for each in own:
-            owners = self._buckets[_bucket(kind, each)]
-            if owners[each] == _SEVERAL or not all(
-                owner == me or dissimilar(each, other) for other, owner in owners.items()
-            ):
+            seen = self._buckets[_bucket(entry.kind, each)]
+            if seen[each] > 1 or not all(one in own or dissimilar(each, one) for one in seen):
                 return False
         if not own:
             return False  # the network sees nothing of it
-        return None if (kind, entry.process) in self._unknown else True
+        return None if (entry.kind, entry.process) in self._unknown else True
 
     def all_unique(self, ends: Sequence[Actual]) -> bool | None:
         """Return whether each of several endpoints is unique; False if one is certainly not."""

@@ -443,34 +443,31 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
         if calls and (node, side, name) in known:
             continue
         type_ = _action_type(parts)
-        named = {
-            part: [
+        named = [
+            [
                 each
                 for each in parts
                 if (each.name, each.type) == (f"{name}{_ACTION_PART}{part}", part_type(part, type_))
             ]
             for part in _ACTION_PARTS
-        }
-        count = min(map(len, named.values()))
-        for chosen in list(zip(*named.values(), strict=False))[: 1 if calls else count]:
-            goals = chosen[0]
+        ]
+        whole = list(zip(*named, strict=False))
+        for goal, _, result, feedback, _ in whole[:1] if calls else whole:
             kept.append(
                 ObservedEndpoint(
                     kind=side,
                     node=node,
                     name=name,
                     type=type_,
-                    gid=goals.gid,
-                    address=goals.address,
-                    type_hash=_action_hash(dict(zip(named, chosen, strict=True))),
+                    gid=goal.gid,
+                    address=goal.address,
+                    type_hash=_action_hash(goal, result, feedback),
                 )
             )
-        folded = {
-            id(each)
-            for found in named.values()
-            for each in (found if calls and count else found[:count])
-        }
-        kept.extend(each for each in parts if id(each) not in folded)
+        for found in named if calls and whole else whole:
+            for each in found:
+                parts.remove(each)
+        kept.extend(parts)
     return tuple(kept)
 
 
@@ -490,11 +487,10 @@ def _action_type(parts: Iterable[ObservedEndpoint]) -> str:
     return max(found, key=found.count) if found else ""
 
 
-def _action_hash(parts: Mapping[str, ObservedEndpoint]) -> str | None:
+def _action_hash(*parts: ObservedEndpoint) -> str | None:
     """Return the type hash of an action from those of its parts; None while one is not seen."""
-    found = [parts[part].type_hash for part in ("send_goal", "get_result", "feedback")]
-    known = [each for each in found if each is not None]
-    return join(known) if len(known) == len(found) else None
+    known = [each.type_hash for each in parts if each.type_hash is not None]
+    return join(known) if len(known) == len(parts) else None
 
 
 class Owner(msgspec.Struct, frozen=True):

@@ -180,6 +180,11 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.publisher, self.subscription
 
     @property
+    def endpoints(self) -> tuple[Actual, ...]:
+        """The declared publishers and subscriptions of both nodes."""
+        return (*self.publishers, *self.subscriptions)
+
+    @property
     def requirement(self) -> tuple[UniqueRequirement, UniqueRequirement]:
         """The strongest requirement of each end: several endpoints of a node are one end."""
         return _strongest(self.publishers), _strongest(self.subscriptions)

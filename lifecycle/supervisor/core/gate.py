@@ -19,8 +19,9 @@ from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, wi
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.endpoints import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.measured import PROBATION_S
-from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
+from lifecycle.verify.rules.nodes import UNDECLARED_NODE
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
 from lifecycle.verify.verdict import Finding, FindingKey, Verdict
 

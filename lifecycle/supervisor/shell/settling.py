@@ -17,9 +17,9 @@ from lifecycle.plan.model import Plan
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
-from lifecycle.verify.rules.endpoints import DEFINITION_DIFFERS
+from lifecycle.verify.rules.endpoints import DEFINITION_DIFFERS, UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.matching import SERVER_OF
-from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
+from lifecycle.verify.rules.nodes import UNDECLARED_NODE
 from lifecycle.verify.rules.parameters import SILENT_CLOCK
 from lifecycle.verify.tool_filter import is_hidden_node
 from lifecycle.verify.verdict import Finding, FindingKey, Verdict

@@ -1,4 +1,4 @@
-"""The registry of rules: families of them, each a tuple of rules and the check that finds them."""
+"""The registry of rules: families of them, each a module with its rules and their check."""
 
 from __future__ import annotations
 
@@ -20,22 +20,12 @@ from lifecycle.verify.view import View
 
 __all__ = ["CHECKS", "RULES", "About", "Heals", "Rule", "rule"]
 
-_FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], ...] = (
-    (nodes.RULES, nodes.check),
-    (endpoints.RULES, endpoints.check),
-    (nodes.OUTSIDER_RULES, nodes.check_outsiders),
-    (qos.RULES, qos.check),
-    (matching.RULES, matching.check),
-    (state.RULES, state.check),
-    (parameters.RULES, parameters.check),
-    (flows.RULES, flows.check),
-    (measured.RULES, measured.check),
-)
+_FAMILIES = (nodes, endpoints, qos, matching, state, parameters, flows, measured)
 
-RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *RUN_RULES)
+RULES: tuple[Rule, ...] = (*(rule for each in _FAMILIES for rule in each.RULES), *RUN_RULES)
 """Every rule, in the order in which findings are reported."""
 
-CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(check for _, check in _FAMILIES)
+CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(each.check for each in _FAMILIES)
 """Every family's check; each yields its findings in a fixed order."""
 
 _BY_ID = {each.id: each for each in RULES}

@@ -2,6 +2,10 @@
 
 DDS matches by the name of a type, so two ends with two definitions match and exchange garbage. Each
 end announces the hash of its definition (REP-2016), and rosidl installs the hash beside it.
+
+A publisher on a declared topic and a server of a declared service or action feed the system,
+whatever their node is called. One that only subscribes or calls is tolerated where the policy names
+it.
 """
 
 from __future__ import annotations
@@ -11,12 +15,12 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
-from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.tool_filter import action_part, part_type
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.tool_filter import action_part, of_supervisors, part_type
+from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 
 MISSING_ENDPOINT = Rule(
@@ -62,7 +66,7 @@ UNDECLARED = {
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge the existence, the type, and the definition of the type of endpoints."""
+    """Judge the existence, the type, and its definition, of endpoints; then those of outsiders."""
     known: Counter[tuple[str, EndpointKind | None]] = Counter()
     if any(actual.unseen for actual in view.actual):
         known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
@@ -74,6 +78,9 @@ def check(view: View) -> Iterator[Finding]:
     yield from _undeclared(view)
     yield from _conflicts(view)
     yield from _definitions(view)
+    if view.plan.policy.undeclared_nodes is EndpointPolicy.DECLARED:
+        yield from _offered_by_tools(view)
+        yield from _unattributed(view)
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
@@ -199,22 +206,20 @@ def _conflicts(view: View) -> Iterator[Finding]:
     for actual in view.actual:
         types.setdefault((actual.kind.meets_in, actual.name), {})[actual.planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
-    undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
+    undeclared = (
         *(each for each in view.seen if each.planned is None),
-        *(each for each in others if not each.kind.is_topic),
+        *(SeenEndpoint.of(each) for each in others if not each.kind.is_topic),
     )
     for seen in undeclared:
         what = seen.kind.meets_in
         declared = types.get((what, seen.name))
         if declared is None or seen.type in declared:
             continue
-        word = seen.kind.noun
-        who = seen.node or "an unknown node"
         yield TYPE_MISMATCH.finding(
             subject=seen.name,
             expected=" or ".join(declared),
             observed=seen.type or "no type",
-            message=f"the {word} of {seen.name} in {who} matches none: it is"
+            message=f"{seen.where} matches none: it is"
             f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
             f" {' or '.join(declared)}",
             node=seen.node,
@@ -229,9 +234,18 @@ DEFINITION_DIFFERS = Rule(
     fix="build both ends from one version of the interface package, and install the same here",
     concerns_flow=True,
 )
+UNATTRIBUTED_ENDPOINT = Rule(
+    id="graph.unattributed-endpoint",
+    meaning="the graph has an endpoint whose node is not known",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="wait for discovery; a plain DDS program has no node name: give it another domain",
+    heals=Heals.WITH_TIME,
+    if_undiscovered=True,
+    awaits=MISSING_NODE,  # discovery shows an endpoint before its node
+)
 RULES = (
     *(MISSING_ENDPOINT, UNSEEN_ENDPOINT, *UNDECLARED.values()),
-    *(TYPE_MISMATCH, ENDPOINT_ERROR, DEFINITION_DIFFERS),
+    *(TYPE_MISMATCH, ENDPOINT_ERROR, DEFINITION_DIFFERS, UNATTRIBUTED_ENDPOINT),
 )
 
 
@@ -241,7 +255,10 @@ _Place = tuple[str, str, str]
 
 def _definitions(view: View) -> Iterator[Finding]:
     """Compare the ends of everything that is declared, with what is installed or each other."""
-    installed = {_place(each.planned): each.planned.type_hash for each in view.actual}
+    installed = {
+        (each.kind.meets_in, each.name, each.planned.type): each.planned.type_hash
+        for each in view.actual
+    }
     unknown: dict[str, list[SeenEndpoint]] = {}
     differing: dict[Finding, None] = {}
     for place, ends in _ends(view).items():
@@ -294,9 +311,8 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _place(end: SeenEndpoint | PlannedEndpoint) -> _Place:
-    name = end.resolved if isinstance(end, PlannedEndpoint) else end.name
-    return end.kind.meets_in, name, end.type
+def _place(end: SeenEndpoint) -> _Place:
+    return end.kind.meets_in, end.name, end.type
 
 
 def _at(end: SeenEndpoint) -> Position | None:
@@ -334,3 +350,81 @@ def _unverifiable(node: str, ends: list[SeenEndpoint]) -> Finding:
         node=node,
         hint="ROS 2 announces them since Iron; run the node under a newer one, or accept the gap",
     )
+
+
+_GUID_DIGITS = 32
+_VENDORS = {
+    0x0101: "RTI Connext DDS",
+    0x0102: "OpenSplice DDS",
+    0x0103: "OpenDDS",
+    0x0106: "InterCOM DDS",
+    0x0107: "CoreDX DDS",
+    0x0109: "RTI Connext Micro",
+    0x010A: "Vortex Cafe",
+    0x010D: "Vortex Lite",
+    0x010F: "Fast DDS",
+    0x0110: "Cyclone DDS",
+    0x0111: "GurumDDS",
+    0x0112: "RustDDS",
+    0x0114: "Dust DDS",
+}
+"""By the vendor id that a GUID prefix begins with (DDSI-RTPS §9.3.1.5, dds-foundation.org)."""
+
+
+def _offered_by_tools(view: View) -> Iterator[Finding]:
+    supervisors = of_supervisors(view.plan, view.of_tools)
+    for endpoint in view.of_tools:
+        if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
+            continue
+        word = endpoint.kind.noun
+        of_supervisor = view.names.is_of_supervisors(endpoint.kind, endpoint.name)
+        verb = "feeds" if endpoint.kind.is_topic else "serves"
+        whom = "whoever asks for the supervisor" if of_supervisor else "the system"
+        yield UNDECLARED[endpoint.kind].finding(
+            subject=endpoint.name,
+            expected=f"no such {word} of {endpoint.node}",
+            observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
+            message=f"the manifest does not declare the {word} of {endpoint.name} in"
+            f" {endpoint.node}, which {verb} {whom}",
+            node=endpoint.node,
+            endpoint=endpoint.kind,
+            hint="only the supervisor of this system offers it; if several nodes do, none is taken"
+            " for the supervisor: stop those that are not"
+            if of_supervisor
+            else f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
+            " it, or declare its node",
+        )
+
+
+def _unattributed(view: View) -> Iterator[Finding]:
+    """Closed world: every endpoint must be attributed to a node, at the latest before the gate.
+
+    After it, who only listens may be a tool whose name has yet to come; who feeds may not.
+    """
+    for endpoint in view.unattributed:
+        word = endpoint.kind.noun
+        feeds = view.names.fed_by(endpoint.kind, endpoint.name)
+        # The supervisor of another machine begins to offer them after its gate.
+        feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
+        violated = feeds or view.stage is Stage.CONNECTED
+        yield UNATTRIBUTED_ENDPOINT.finding(
+            outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
+            subject=endpoint.name,
+            expected=f"{word} of a declared node",
+            observed=f"{word} of an unknown node",
+            message=f"no known node has this {word} of {endpoint.name}{described(endpoint)}",
+            endpoint=endpoint.kind,
+        )
+
+
+def described(endpoint: ObservedEndpoint) -> str:
+    """Describe an endpoint's participant as far as known: vendor, address, GID; else empty."""
+    known = []
+    vendor = int(endpoint.gid[:4], 16) if len(endpoint.gid) == _GUID_DIGITS else 0
+    if vendor:
+        known.append(f"a participant of {_VENDORS.get(vendor, f'DDS vendor {vendor:#06x}')}")
+    if endpoint.address:
+        known.append(f"at {endpoint.address}")
+    if endpoint.gid:
+        known.append(f"GID {endpoint.gid}")
+    return f" ({', '.join(known)})" if known else ""

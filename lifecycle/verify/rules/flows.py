@@ -208,8 +208,7 @@ def check(view: View) -> Iterator[Finding]:
 
 def is_missing(flow: FlowView) -> bool:
     """Return whether nothing is seen of one end: it is missing, and that is said."""
-    ends = (*flow.publishers, *flow.subscriptions)
-    return any(end.observed is None and end.report is None for end in ends)
+    return any(end.observed is None and end.report is None for end in flow.endpoints)
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
@@ -320,7 +319,7 @@ _WORDS = {
 
 
 def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
-    ends = (*flow.publishers, *flow.subscriptions)
+    ends = flow.endpoints
     used = effective_transport(flow)
     demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
     if demanding and used not in NETWORK_MEDIA:
@@ -337,7 +336,7 @@ def _is_decided(view: View, flow: FlowView) -> bool:
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
         or connection_of(end.owner, end.planned)
         or end.owner.connections.urls
-        for end in (*flow.publishers, *flow.subscriptions)
+        for end in flow.endpoints
     )
 
 

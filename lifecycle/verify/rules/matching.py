@@ -187,8 +187,7 @@ def is_unreported(flow: FlowView) -> bool:
     """Return whether both ends of a flow are there and fit, and neither reports its matches."""
     if flow.planned.linked or _cause(flow):
         return False  # a link has a finding of its own, and so has what cannot match
-    ends = (*flow.publishers, *flow.subscriptions)
-    return all(end.report is None or end.report.matched is None for end in ends)
+    return all(end.report is None or end.report.matched is None for end in flow.endpoints)
 
 
 def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:

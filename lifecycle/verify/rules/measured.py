@@ -248,14 +248,15 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 def check(view: View) -> Iterator[Finding]:
     """Judge every number that is declared of a flow, or name it as not measured."""
     counted = _counted(view)
-    of_end: dict[int, list[_Counted]] = {}
+    of_end: dict[tuple[str, EndpointKind, str], list[_Counted]] = {}
     for each in counted:
-        for end in (*each.flow.publishers, *each.flow.subscriptions):
-            of_end.setdefault(id(end), []).append(each)
+        for end in {(one.node, one.kind, one.name) for one in each.flow.endpoints}:
+            of_end.setdefault(end, []).append(each)
     for actual in view.actual:
         if actual.observed is not None or actual.report is not None:
             for quantity in actual.planned.quantities:
-                yield from _unmeasured_at(actual, quantity, of_end.get(id(actual), []))
+                flows = of_end.get((actual.node, actual.kind, actual.name), [])
+                yield from _unmeasured_at(actual, quantity, flows)
     for each in counted:
         for quantity in each.flow.planned.quantities:
             if why := each.why_not(quantity):

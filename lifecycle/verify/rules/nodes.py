@@ -1,9 +1,4 @@
-"""Rules about node names: missing, undeclared, duplicate; and endpoints of undeclared nodes. Pure.
-
-A publisher on a declared topic and a server of a declared service or action feed the system,
-whatever their node is called. One that only subscribes or calls is tolerated where the policy names
-it.
-"""
+"""Rules about node names: missing, undeclared, duplicate. Pure."""
 
 from __future__ import annotations
 
@@ -12,11 +7,8 @@ from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
 from lifecycle.plan.model import PlannedProcess
-from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.rules.endpoints import UNDECLARED
-from lifecycle.verify.tool_filter import of_supervisors
 from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import View, brings_up, is_beyond
 
@@ -182,100 +174,3 @@ def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding
             if missing
             else "",
         )
-
-
-UNATTRIBUTED_ENDPOINT = Rule(
-    id="graph.unattributed-endpoint",
-    meaning="the graph has an endpoint whose node is not known",
-    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
-    fix="wait for discovery; a plain DDS program has no node name: give it another domain",
-    heals=Heals.WITH_TIME,
-    if_undiscovered=True,
-    awaits=MISSING_NODE,  # discovery shows an endpoint before its node
-)
-OUTSIDER_RULES = (UNATTRIBUTED_ENDPOINT,)
-
-_GUID_DIGITS = 32
-_VENDORS = {
-    0x0101: "RTI Connext DDS",
-    0x0102: "OpenSplice DDS",
-    0x0103: "OpenDDS",
-    0x0106: "InterCOM DDS",
-    0x0107: "CoreDX DDS",
-    0x0109: "RTI Connext Micro",
-    0x010A: "Vortex Cafe",
-    0x010D: "Vortex Lite",
-    0x010F: "Fast DDS",
-    0x0110: "Cyclone DDS",
-    0x0111: "GurumDDS",
-    0x0112: "RustDDS",
-    0x0114: "Dust DDS",
-}
-"""By the vendor id that a GUID prefix begins with (DDSI-RTPS §9.3.1.5, dds-foundation.org)."""
-
-
-def check_outsiders(view: View) -> Iterator[Finding]:
-    """Judge what tools offer under declared names, and what no known node has."""
-    if view.plan.policy.undeclared_nodes is not EndpointPolicy.DECLARED:
-        return
-    yield from _offered_by_tools(view)
-    yield from _unattributed(view)
-
-
-def _offered_by_tools(view: View) -> Iterator[Finding]:
-    supervisors = of_supervisors(view.plan, view.of_tools)
-    for endpoint in view.of_tools:
-        if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
-            continue
-        word = endpoint.kind.noun
-        of_supervisor = view.names.is_of_supervisors(endpoint.kind, endpoint.name)
-        verb = "feeds" if endpoint.kind.is_topic else "serves"
-        whom = "whoever asks for the supervisor" if of_supervisor else "the system"
-        yield UNDECLARED[endpoint.kind].finding(
-            subject=endpoint.name,
-            expected=f"no such {word} of {endpoint.node}",
-            observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
-            message=f"the manifest does not declare the {word} of {endpoint.name} in"
-            f" {endpoint.node}, which {verb} {whom}",
-            node=endpoint.node,
-            endpoint=endpoint.kind,
-            hint="only the supervisor of this system offers it; if several nodes do, none is taken"
-            " for the supervisor: stop those that are not"
-            if of_supervisor
-            else f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
-            " it, or declare its node",
-        )
-
-
-def _unattributed(view: View) -> Iterator[Finding]:
-    """Closed world: every endpoint must be attributed to a node, at the latest before the gate.
-
-    After it, who only listens may be a tool whose name has yet to come; who feeds may not.
-    """
-    for endpoint in view.unattributed:
-        word = endpoint.kind.noun
-        feeds = view.names.fed_by(endpoint.kind, endpoint.name)
-        # The supervisor of another machine begins to offer them after its gate.
-        feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
-        violated = feeds or view.stage is Stage.CONNECTED
-        yield UNATTRIBUTED_ENDPOINT.finding(
-            outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
-            subject=endpoint.name,
-            expected=f"{word} of a declared node",
-            observed=f"{word} of an unknown node",
-            message=f"no known node has this {word} of {endpoint.name}{described(endpoint)}",
-            endpoint=endpoint.kind,
-        )
-
-
-def described(endpoint: ObservedEndpoint) -> str:
-    """Describe an endpoint's participant as far as known: vendor, address, GID; else empty."""
-    known = []
-    vendor = int(endpoint.gid[:4], 16) if len(endpoint.gid) == _GUID_DIGITS else 0
-    if vendor:
-        known.append(f"a participant of {_VENDORS.get(vendor, f'DDS vendor {vendor:#06x}')}")
-    if endpoint.address:
-        known.append(f"at {endpoint.address}")
-    if endpoint.gid:
-        known.append(f"GID {endpoint.gid}")
-    return f" ({', '.join(known)})" if known else ""

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Condition,
+    Discovery,
     DiscoveryRange,
     EndpointKind,
     RosArguments,
@@ -20,7 +21,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.build import dependency_levels, planned_processes
+from lifecycle.plan.build import dependency_levels
 from lifecycle.plan.processes import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
 
@@ -92,13 +93,9 @@ def test_a_unique_subscription_needs_no_participant():
 # --- processes
 
 
-def processes(*nodes, environment=None):
-    return planned_processes(
-        nodes,
-        domain_id=7,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        environment=environment or {},
-    )
+def processes(*nodes):
+    discovery = Discovery(domain_id=7, range=DiscoveryRange.LOCALHOST)
+    return planned(*nodes, discovery=discovery).processes
 
 
 def test_a_process_is_named_by_its_node_or_as_declared():

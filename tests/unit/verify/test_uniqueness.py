@@ -236,7 +236,7 @@ def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
             # What is not known hides no equal one but in its own process.
             if other != index and side is kind and (each is not None or place == process)
         ]
-        end = replace(END, report=reports[index])
+        end = replace(END, node=f"/n{index}", report=reports[index])
         assert uniqueness.is_unique(end) is by_comparing(located(nfes, process[0]), others)
 
 
