@@ -207,22 +207,13 @@ def interface_of(entity: Any) -> type[Any]:
     raise TypeError(f"cannot tell the interface of {entity!r}")
 
 
-class MachineOwner(Protocol):
-    """What the state machine asks and notifies."""
-
-    def is_driven(self) -> bool:
-        """Whether a supervisor drives the node."""
-
-    def may_activate(self) -> bool:
-        """Whether an activate request may be carried out now."""
-
-    def state_changed(self) -> None:
-        """The state is another one: read `label`."""
-
-    def complain(self, text: str) -> None:
-        """Log why a request or a callback failed."""
-
-
+_BY_LABEL = {
+    "configure": "trigger_configure",
+    "activate": "trigger_activate",
+    "deactivate": "trigger_deactivate",
+    "cleanup": "trigger_cleanup",
+    "shutdown": "trigger_shutdown",
+}
 _DONE_IN = {
     Transition.TRANSITION_CONFIGURE: ("inactive", "active"),
     Transition.TRANSITION_CLEANUP: ("unconfigured",),
@@ -243,13 +234,28 @@ class RclpyStateMachine:
     is reached already, and FAILURE where the gate is closed. By its services, and from its
     supervisor, the same request is an error.
 
+    Args:
+        node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.
+        is_driven: a supervisor drives it.
+        may_activate: whether an activate request may be carried out now.
+        changed: is called when the state is another one: read `label`.
+
     Raises:
         MiddlewareError: rclpy keeps its state machine otherwise than is known.
     """
 
-    def __init__(self, node: LifecycleNodeMixin, owner: MachineOwner) -> None:
+    def __init__(
+        self,
+        node: LifecycleNodeMixin,
+        *,
+        is_driven: bool,
+        may_activate: Callable[[], bool],
+        changed: Callable[[], None],
+    ) -> None:
         self._node = node
-        self._owner = owner
+        self._is_driven = is_driven
+        self._may_activate = may_activate
+        self._changed = changed
         self._change = private(node, _CHANGE, _DRIVE)
         self._is_complete = False
         self._is_asked = False  # by its supervisor or a client
@@ -301,10 +307,10 @@ class RclpyStateMachine:
         self.complete()
         # What its callbacks ask for is its own code's.
         is_asked, self._is_asked = self._is_asked, False
-        is_own = not is_asked and self._owner.is_driven()
+        is_own = not is_asked and self._is_driven
         if is_own and self.label in _DONE_IN.get(transition_id, ()):
             return TransitionCallbackReturn.SUCCESS
-        if transition_id == Transition.TRANSITION_ACTIVATE and not self._owner.may_activate():
+        if transition_id == Transition.TRANSITION_ACTIVATE and not self._may_activate():
             if not is_own:
                 raise RCLError("the gate of its supervisor is closed")
             if not self._has_said:
@@ -317,22 +323,30 @@ class RclpyStateMachine:
         try:
             return self._change(transition_id)
         finally:
-            self._owner.state_changed()
+            self._changed()
+
+    def _say_that_it_is_held(self) -> None:
+        if not self._has_said:
+            self._has_said = True
+            self._node.get_logger().error(
+                "its own code asks to activate it while the gate of its supervisor is closed: it "
+                "activates once the gate lets it through"
+            )
 
     def _reporting(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         name = getattr(callback, "__name__", "a callback")
 
         @functools.wraps(callback)
         def call(previous: Any) -> Any:
-            self._owner.state_changed()
+            self._changed()
             try:
                 returned = callback(previous)
             except Exception:
-                self._owner.complain(traceback.format_exc())
+                self._node.get_logger().error(traceback.format_exc())
                 raise
             if isinstance(returned, TransitionCallbackReturn):
                 return returned
-            self._owner.complain(
+            self._node.get_logger().error(
                 f"cannot use {returned!r}, returned by {name}; return a TransitionCallbackReturn"
             )
             return TransitionCallbackReturn.ERROR
@@ -348,7 +362,7 @@ class RclpyStateMachine:
             except RCLError as error:
                 reason = str(error).splitlines()[0].partition(", at /")[0]
                 asked = request.transition.label or f"number {request.transition.id}"
-                self._owner.complain(
+                self._node.get_logger().error(
                     f"cannot take transition {asked} in state {self.label!r}: {reason}"
                 )
                 response.success = False

@@ -85,7 +85,12 @@ class ForeignNode(NodeInHost):
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
-            self._machine = RclpyStateMachine(node, self)
+            self._machine = RclpyStateMachine(
+                node,
+                is_driven=bool(supervisor),
+                may_activate=self.may_activate,
+                changed=self.state_changed,
+            )
         if self._let_through:
             self.gate.open()
         self._services = self._serve()
@@ -297,7 +302,7 @@ class ForeignNode(NodeInHost):
                     f"deadline is {limit_s:g} s"
                 )
                 result = Result(outcome=CallbackOutcome.ERROR, error=why)
-                self.complain(why)
+                self.log.error(why)
                 self._transition("deactivate")  # nobody waits for it any more
             return result
         finally:
@@ -319,11 +324,7 @@ class ForeignNode(NodeInHost):
             return SUCCESS
         return SUCCESS if self._machine.label == "finalized" else self._transition("shutdown")
 
-    # What its state machine asks and notifies (middleware's MachineOwner).
-
-    def is_driven(self) -> bool:
-        """Whether a supervisor drives it."""
-        return bool(self._supervisor)
+    # What its state machine asks and notifies.
 
     def may_activate(self) -> bool:
         """Whether its supervisor has let it through."""
@@ -336,10 +337,6 @@ class ForeignNode(NodeInHost):
             self.gate.close()
         for listener in self.listeners:
             listener(self)
-
-    def complain(self, text: str) -> None:
-        """Log it."""
-        self.log.error(text)
 
     def _release(self) -> None:
         self._let_through = True
@@ -369,5 +366,5 @@ class ForeignNode(NodeInHost):
         if outcome is CallbackOutcome.SUCCESS:
             return SUCCESS
         why = f"{self.full_name}: on_{operation} returned {returned.name}"
-        self.complain(why)
+        self.log.error(why)
         return Result(outcome=outcome, error=why)
