@@ -207,13 +207,6 @@ def interface_of(entity: Any) -> type[Any]:
     raise TypeError(f"cannot tell the interface of {entity!r}")
 
 
-_BY_LABEL = {
-    "configure": "trigger_configure",
-    "activate": "trigger_activate",
-    "deactivate": "trigger_deactivate",
-    "cleanup": "trigger_cleanup",
-    "shutdown": "trigger_shutdown",
-}
 _DONE_IN = {
     Transition.TRANSITION_CONFIGURE: ("inactive", "active"),
     Transition.TRANSITION_CLEANUP: ("unconfigured",),
@@ -315,7 +308,7 @@ class RclpyStateMachine:
                 raise RCLError("the gate of its supervisor is closed")
             if not self._has_said:
                 self._has_said = True
-                self._owner.complain(
+                self._node.get_logger().error(
                     "its own code asks to activate it while the gate of its supervisor is closed: "
                     "it activates once the gate lets it through"
                 )
@@ -324,14 +317,6 @@ class RclpyStateMachine:
             return self._change(transition_id)
         finally:
             self._changed()
-
-    def _say_that_it_is_held(self) -> None:
-        if not self._has_said:
-            self._has_said = True
-            self._node.get_logger().error(
-                "its own code asks to activate it while the gate of its supervisor is closed: it "
-                "activates once the gate lets it through"
-            )
 
     def _reporting(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         name = getattr(callback, "__name__", "a callback")
