@@ -27,7 +27,6 @@ import pytest
 
 if TYPE_CHECKING:
     from lifecycle.node.host.in_process import NodeInProcess
-    from lifecycle.plan.model import Plan, PlannedNode
 
 DOMAINS = (*range(215, 232), *range(70, 102))
 """Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be."""
@@ -91,7 +90,8 @@ class LifecycleSystem:
     Attributes:
         manifest: what it brings up.
         domain_id: its ROS domain, which is that of the test's process, too.
-        environment: for programs that shall see the system, `ros2` for one.
+        environment: for programs that shall see the system, `ros2` for one: that of the test, which
+            has the domain, and where it logs.
         events: what it has reported so far: JSON events, docs/events.md.
         directory: with `log`, the logs of its processes, and `stderr`, what `lifecycle up` said.
     """
@@ -108,11 +108,9 @@ class LifecycleSystem:
         self.directory = directory
         self.environment = {
             **os.environ,
-            "ROS_DOMAIN_ID": str(domain_id),
             "ROS_LOG_DIR": str(directory / "log"),
             "XDG_RUNTIME_DIR": str(directory),
         }
-        self.environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self.events: list[dict[str, Any]] = []
         self._result: dict[str, Any] | None = None
         with (directory / "stderr").open("wb") as said:
@@ -339,11 +337,14 @@ def lifecycle_node(
             arguments: Mapping[str, object] | None = None,
             to: str = "active",
         ) -> NodeInProcess:
-            plan, planned = _planned(manifest, node, arguments or {}, lifecycle_domain)
-            for name, value in {
-                "ROS_LOG_DIR": str(tmp_path),
-                **dict(planned.run.environment),
-            }.items():
+            from lifecycle.manifest.loading import load
+            from lifecycle.plan.build import build_plan, find_node
+
+            given = {name: str(value) for name, value in (arguments or {}).items()}
+            loaded = load(os.fspath(manifest), given)
+            plan = build_plan(loaded.manifest, domain_id=lifecycle_domain)
+            planned = find_node(plan, node)
+            for name, value in (("ROS_LOG_DIR", str(tmp_path)), *planned.run.environment):
                 monkeypatch.setenv(name, value)
             if planned.run.working_directory:
                 monkeypatch.chdir(planned.run.working_directory)
@@ -362,17 +363,6 @@ def lifecycle_node(
             return made
 
         yield make
-
-
-def _planned(
-    manifest: str | os.PathLike[str], node: str, arguments: Mapping[str, object], domain_id: int
-) -> tuple[Plan, PlannedNode]:
-    from lifecycle.manifest.loading import load
-    from lifecycle.plan.build import build_plan, find_node
-
-    loaded = load(os.fspath(manifest), {name: str(value) for name, value in arguments.items()})
-    plan = build_plan(loaded.manifest, domain_id=domain_id)
-    return plan, find_node(plan, node)
 
 
 @pytest.hookimpl(wrapper=True)
