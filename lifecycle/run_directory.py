@@ -76,17 +76,13 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         run_id: value of LIFECYCLE_RUN in every process of the run.
         boot_id: of the kernel; a record of an earlier boot names no living process.
-        began_s: seconds since the epoch.
-        domain_id: where the system is; None if it was not written down.
         participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
     """
 
     run_id: str
     boot_id: str
-    began_s: float
     supervisor: ChildRecord
     children: tuple[ChildRecord, ...] = ()
-    domain_id: int | None = None
     participant: str = ""
 
 
@@ -225,12 +221,10 @@ class RunDirectory:
         participant: GUID prefix of our supervisor's own, for the record; empty before there is one.
     """
 
-    def __init__(self, path: Path, run_id: str, domain_id: int | None = None) -> None:
+    def __init__(self, path: Path, run_id: str) -> None:
         self.path = path
         self.run_id = run_id
-        self.domain_id = domain_id
         self.participant = ""
-        self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
         self._children: dict[int, ChildRecord] = {}
@@ -242,10 +236,9 @@ class RunDirectory:
         name: str,
         run_id: str,
         *,
-        domain_id: int | None = None,
         processes: Mapping[int, str] = MappingProxyType({}),
     ) -> RunDirectory:
-        """Take the directory for the run `run_id`, in the domain `domain_id`.
+        """Take the directory for the run `run_id`.
 
         `processes` are those of it that run already, names by pid.
 
@@ -253,7 +246,7 @@ class RunDirectory:
             UsageError: another supervisor has it, or the directory belongs to another user, is
                 writable by others, or cannot be made or written.
         """
-        directory = cls(root / name, run_id, domain_id)
+        directory = cls(root / name, run_id)
         try:
             directory._take()
             directory.previous = read_record(directory.path)
@@ -334,12 +327,10 @@ class RunDirectory:
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
-            began_s=self.began_s,
             supervisor=ChildRecord(
                 name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
             ),
             children=tuple(self._children.values()),
-            domain_id=self.domain_id,
             participant=self.participant,
         )
         part = self.path / _PART_NAME

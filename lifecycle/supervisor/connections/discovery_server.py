@@ -21,10 +21,10 @@ from lifecycle.middleware.discovery.discovery_server import (
 )
 from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.control.status import finding_of
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
-from lifecycle.supervisor.run.events import Failure, ProcessChanged
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.supervisor.run.events import Failure, ProcessChanged, StepFailedError
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding

@@ -51,6 +51,7 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
+from lifecycle.supervisor.control.status import ended_early
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
 from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
@@ -65,8 +66,8 @@ from lifecycle.supervisor.run.events import (
     Listener,
     Notice,
     RunStarted,
+    StepFailedError,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, ended_early
 from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     UpOptions,
@@ -141,7 +142,6 @@ def up(
         runtime_root(os.environ),
         run_name(plan, options.machine),
         process.run_id,
-        domain_id=plan.domain_id,
         processes={process.popen.pid: FORK_SERVER},
     )
     journal = Journal(

@@ -31,7 +31,7 @@ from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check
-from lifecycle.supervisor.control.status import process_state, system_status
+from lifecycle.supervisor.control.status import process_state, result_of, system_status
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
@@ -48,9 +48,9 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     Notice,
     ProcessChanged,
+    StepFailedError,
     Stopped,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, result_of
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
@@ -152,8 +152,9 @@ class Supervisor:
             effects.Answer: self._answer,
             effects.Wake: self._wake_at,
         }
-        system.on_change = self._touch
+        system.touch = self._touch
         system.on_health = self._health
+        system.liveliness.listen(self._touch)
         system.liveliness.listen(self._silence)
 
     # What others ask

@@ -15,8 +15,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
-from lifecycle.supervisor.run.events import Event
-from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.events import Event, StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeForkServer, World
