@@ -138,6 +138,7 @@ def up(
     emit.listen(guarded)
     emit.listen(service.on_event)
     _preload(process, plan, processes)
+    logs = log_directory(os.environ, plan.system)
     directory = RunDirectory.acquire(
         runtime_root(os.environ),
         run_name(plan, options.machine),
@@ -145,7 +146,7 @@ def up(
         processes={process.popen.pid: FORK_SERVER},
     )
     journal = Journal(
-        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
+        logs, plan.system, directory.run_id, say=lambda text: emit(Notice(message=text))
     )
     emit.listen(journal.on_event)
     try:
@@ -158,7 +159,6 @@ def up(
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             leaving.callback(service.watch())
-            logs = log_directory(os.environ, plan.system)
             begin_logs(os.environ, logs, plan.system)
             system = System(
                 plan,
@@ -169,7 +169,6 @@ def up(
                 # What a fork server that was started before `_enter_graph` has to pass on.
                 variables=tuple((n, os.environ[n]) for n in _GRAPH_VARIABLES if n in os.environ),
             )
-            leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
@@ -204,6 +203,7 @@ def up(
         process.close()
         # Once our own participant is gone, too.
         sweep(within_s=_LET_GO_S)
+        journal.close()
         directory.release()
     guarded.check()
     return result
