@@ -173,7 +173,7 @@ def up(
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
-                    await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
+                    await discovery_server.begin(system, fork_server)
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 emit(_started(system, observer_participant, str(logs)))
@@ -290,11 +290,6 @@ async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) 
         await asyncio.sleep(_INTERFACE_S)
 
 
-def _serves(plan: Plan, options: UpOptions) -> bool:
-    server = plan.server
-    return server is not None and server.machine in own_machines(plan, options.machine)
-
-
 async def _observer_participant(
     plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
 ) -> ObserverParticipant:
@@ -335,7 +330,7 @@ async def _observer_participant(
     # Nodes elsewhere would be found: they answer to ports of ours.
     discovery = observer_participant.discovery
     port = None
-    if local_processes(plan, options.machine):
+    if plan.processes:
         port = missing_port(discovery.domain_id, discovery.urls, os.environ)
     if port is not None:
         observer_participant.destroy()

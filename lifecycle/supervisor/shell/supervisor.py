@@ -189,7 +189,7 @@ class Supervisor:
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
-            check(order, self.system, self.system.run.options.machine)
+            check(order, self.system)
         except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
         run, change = self.system.run, None
