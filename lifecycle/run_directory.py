@@ -276,8 +276,6 @@ class RunDirectory:
 
         Raises:
             BlockingIOError: another supervisor has it.
-            OSError: it cannot be made.
-            UsageError: it is not ours alone.
         """
         _refuse_unsafe_parents(self.path.parent)
         path = self.path / "lock"
@@ -375,11 +373,7 @@ def read_record(path: Path) -> RunRecord | None:
 
 
 def _regular(path: Path) -> bytes:
-    """Read a file, and no more than a record holds.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Read a file, and no more than a record holds."""
     # Not blocking: a pipe in its place might have no writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OURS)
     with os.fdopen(descriptor, "rb") as file:
@@ -573,11 +567,7 @@ def _refuse_unless_private(path: Path) -> None:
 
 
 def _refuse_unless_run(path: Path) -> None:
-    """Insist that a directory is a run's, or empty: at the end all that is in it is removed.
-
-    Raises:
-        UsageError: it holds something else.
-    """
+    """Insist that a directory is a run's, or empty: at the end all that is in it is removed."""
     try:
         names = {each.name for each in path.iterdir()}
     except FileNotFoundError:
@@ -593,9 +583,6 @@ def _refuse_unsafe_parents(root: Path) -> None:
 
     Each directory above it must belong to this user or to root, and be writable by all only with
     the sticky bit, as /tmp is.
-
-    Raises:
-        UsageError: another user can.
     """
     trusted = {os.getuid(), 0, _unmapped_uid()}
     # Where links lead to: they lie in the directories above, which are looked at as well.
