@@ -38,7 +38,6 @@ from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
-from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (
     FORK_SERVER,
     RunDirectory,
@@ -91,9 +90,6 @@ Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
 
 THREADS = 24
 """A supervisor has up to 16, most of them its participant's."""
-
-OBSERVER_TRIES = 4
-
 
 Conclude = Callable[[UpResult], ExitCode]
 
@@ -293,10 +289,7 @@ async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) 
 async def _observer_participant(
     plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
 ) -> ObserverParticipant:
-    """Make the supervisor's participant; on another port if a discovery server is not reached.
-
-    Fast DDS may never use the first connection to it (middleware/discovery/tcp.py).
-    """
+    """Make the supervisor's participant."""
     with ending.raised():
         await _until_interface_is_up(plan, options, emit)
     # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
@@ -306,29 +299,22 @@ async def _observer_participant(
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
-    planned = connections = observer_connections(plan, options.machine)
-    for number in range(OBSERVER_TRIES):
-        with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
-            observer_participant = ObserverParticipant.open(
-                plan.domain_id,
-                connections,
-                unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
-                events=wires and (dynamic or layer.events),
-                settle_s=plan.discovery.settle_s,
-            )
-        if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
-            break
+    with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
+        observer_participant = ObserverParticipant.open(
+            plan.domain_id,
+            observer_connections(plan, options.machine),
+            unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+            events=wires and (dynamic or layer.events),
+            settle_s=plan.discovery.settle_s,
+        )
+    discovery = observer_participant.discovery
+    if not discovery.reaches_servers():
         observer_participant.destroy()
-        connections = moved_observer(plan, planned, number)
-        emit(
-            Notice(
-                message="the supervisor's own participant is made again on a fresh port: the "
-                "discovery server did not take its connection; "
-                f"try {number + 1} of {OBSERVER_TRIES - 1}"
-            )
+        raise MiddlewareError(
+            "cannot see the graph: the discovery server did not take this supervisor's connection",
+            hint="start it again: Fast DDS 2.14 may never use a connection that it has made",
         )
     # Nodes elsewhere would be found: they answer to ports of ours.
-    discovery = observer_participant.discovery
     port = None
     if plan.processes:
         port = missing_port(discovery.domain_id, discovery.urls, os.environ)
