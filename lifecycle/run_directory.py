@@ -76,17 +76,13 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         run_id: value of LIFECYCLE_RUN in every process of the run.
         boot_id: of the kernel; a record of an earlier boot names no living process.
-        began_s: seconds since the epoch.
-        domain_id: where the system is; None if it was not written down.
         participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
     """
 
     run_id: str
     boot_id: str
-    began_s: float
     supervisor: ChildRecord
     children: tuple[ChildRecord, ...] = ()
-    domain_id: int | None = None
     participant: str = ""
 
 
@@ -225,12 +221,10 @@ class RunDirectory:
         participant: GUID prefix of our supervisor's own, for the record; empty before there is one.
     """
 
-    def __init__(self, path: Path, run_id: str, domain_id: int | None = None) -> None:
+    def __init__(self, path: Path, run_id: str) -> None:
         self.path = path
         self.run_id = run_id
-        self.domain_id = domain_id
         self.participant = ""
-        self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
         self._children: dict[int, ChildRecord] = {}
@@ -242,10 +236,9 @@ class RunDirectory:
         name: str,
         run_id: str,
         *,
-        domain_id: int | None = None,
         processes: Mapping[int, str] = MappingProxyType({}),
     ) -> RunDirectory:
-        """Take the directory for the run `run_id`, in the domain `domain_id`.
+        """Take the directory for the run `run_id`.
 
         `processes` are those of it that run already, names by pid.
 
@@ -253,7 +246,7 @@ class RunDirectory:
             UsageError: another supervisor has it, or the directory belongs to another user, is
                 writable by others, or cannot be made or written.
         """
-        directory = cls(root / name, run_id, domain_id)
+        directory = cls(root / name, run_id)
         try:
             directory._take()
             directory.previous = read_record(directory.path)
@@ -283,8 +276,6 @@ class RunDirectory:
 
         Raises:
             BlockingIOError: another supervisor has it.
-            OSError: it cannot be made.
-            UsageError: it is not ours alone.
         """
         _refuse_unsafe_parents(self.path.parent)
         path = self.path / "lock"
@@ -334,12 +325,10 @@ class RunDirectory:
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
-            began_s=self.began_s,
             supervisor=ChildRecord(
                 name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
             ),
             children=tuple(self._children.values()),
-            domain_id=self.domain_id,
             participant=self.participant,
         )
         part = self.path / _PART_NAME
@@ -384,11 +373,7 @@ def read_record(path: Path) -> RunRecord | None:
 
 
 def _regular(path: Path) -> bytes:
-    """Read a file, and no more than a record holds.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Read a file, and no more than a record holds."""
     # Not blocking: a pipe in its place might have no writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OURS)
     with os.fdopen(descriptor, "rb") as file:
@@ -582,11 +567,7 @@ def _refuse_unless_private(path: Path) -> None:
 
 
 def _refuse_unless_run(path: Path) -> None:
-    """Insist that a directory is a run's, or empty: at the end all that is in it is removed.
-
-    Raises:
-        UsageError: it holds something else.
-    """
+    """Insist that a directory is a run's, or empty: at the end all that is in it is removed."""
     try:
         names = {each.name for each in path.iterdir()}
     except FileNotFoundError:
@@ -602,9 +583,6 @@ def _refuse_unsafe_parents(root: Path) -> None:
 
     Each directory above it must belong to this user or to root, and be writable by all only with
     the sticky bit, as /tmp is.
-
-    Raises:
-        UsageError: another user can.
     """
     trusted = {os.getuid(), 0, _unmapped_uid()}
     # Where links lead to: they lie in the directories above, which are looked at as well.

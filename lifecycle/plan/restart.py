@@ -1,4 +1,6 @@
-"""Restart nodes while others keep running: new TCP ports and peers for their participants. Pure.
+"""Restart nodes while others keep running: new TCP ports and peers for their participants.
+
+Owns: `restarted`, `moving_nodes` and `is_restarted_url`. Pure.
 
 Fast DDS 2.14 keeps an accepted TCP connection under the listening port that its dialler names, also
 once that one is gone, and takes no other in its place: a participant that returns on the same port
@@ -15,17 +17,13 @@ from types import MappingProxyType
 from msgspec.structs import replace
 
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, parse
-from lifecycle.network.ports import MAX_PORT
 from lifecycle.plan.discovery import Hosts, PortPool, contacts_of
-from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
+from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.plan.parties import terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports
 that are negotiated while a system runs, and of groups' (negotiate.GROUP_PORTS_FROM)."""
-
-OBSERVER_PORTS_FROM = 3000
-"""Likewise, of observers that a discovery server did not accept."""
 
 Reported = Mapping[str, Mapping[str, tuple[str, ...]]]
 """What nodes report as their connections: full node name → connection, empty for the node's own
@@ -101,29 +99,6 @@ def restarted(
             for node in plan.nodes
         ),
     )
-
-
-def moved_observer(
-    plan: Plan, connections: ParticipantConnections, number: int
-) -> ParticipantConnections:
-    """Return how an observer is connected on a TCP port that it never had.
-
-    Only a discovery server need know that port. `number` counts the tries from 0.
-
-    Raises:
-        PlanError: there is no such port.
-    """
-    port = plan.discovery.first_port + OBSERVER_PORTS_FROM + number
-    if port > MAX_PORT:
-        raise PlanError(
-            f"cannot give the supervisor's participant port {port}: the highest is {MAX_PORT}",
-            hint="lower 'discovery.first_port'",
-        )
-    urls = tuple(
-        str(replace(url, port=port) if _has_port(url) else url)
-        for url in map(parse, connections.urls)
-    )
-    return replace(connections, urls=urls)
 
 
 def moving_nodes(plan: Plan) -> frozenset[str]:

@@ -228,7 +228,6 @@ RECORD = json.dumps(
     {
         "run_id": "a" * 32,
         "boot_id": Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
-        "began_s": 1.0,
         "supervisor": {"name": "supervisor", "pid": 1, "start_ticks": 1},
         "children": [{"name": "init", "pid": 1, "start_ticks": 1}],
         "domain_id": 0,

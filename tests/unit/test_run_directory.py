@@ -97,7 +97,7 @@ def test_a_supervisor_that_is_starting_is_not_said_to_have_died(tmp_path: Path) 
 
 
 def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> None:
-    killed = RunDirectory.acquire(tmp_path, "robot@30", "abc", domain_id=30)
+    killed = RunDirectory.acquire(tmp_path, "robot@30", "abc")
     killed.record({os.getpid(): "camera"})
     record = (killed.path / "record.json").read_bytes()
     killed.release()
@@ -109,7 +109,6 @@ def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> 
     ticks = start_ticks(os.getpid())
     child = ChildRecord(name="camera", pid=os.getpid(), start_ticks=ticks or 0)
     assert following.previous.children == (child,)
-    assert following.previous.domain_id == 30
     following.release()
     assert RunDirectory.acquire(tmp_path, "robot@30", "ghi").previous is None
 

@@ -130,7 +130,7 @@ def command(
                     plan = started_by_others(plan, without)
                 written.begin(plan)
                 from lifecycle.cli.up_output import output
-                from lifecycle.supervisor.run.failure import ended_early
+                from lifecycle.supervisor.control.status import ended_early
                 from lifecycle.supervisor.run.options import Until, UpOptions
                 from lifecycle.supervisor.run.up import up
 

@@ -266,8 +266,8 @@ class GraphObserver:
     def reaches_servers(self) -> bool:
         """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
 
-        What Fast DDS has not agreed on with a server by then it never will: make another observer,
-        on another port.
+        What Fast DDS has not agreed on with a server by then it never will: only another observer
+        may. Without such servers there is nothing to wait for.
         """
         deadline = time.monotonic() + _AGREED_S
         servers = [

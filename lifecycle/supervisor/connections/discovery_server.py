@@ -21,10 +21,11 @@ from lifecycle.middleware.fastdds.discovery import (
 )
 from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.control.status import finding_of
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
-from lifecycle.supervisor.run.events import Failure, ProcessChanged
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.supervisor.run.events import Failure, ProcessChanged, StepFailedError
+from lifecycle.supervisor.run.options import own_machines
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.catalogue import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
@@ -45,8 +46,8 @@ LOOK_AGAIN_S = 0.02
 """Between two looks whether it listens: a process that is not ours to change does not notify us."""
 
 
-async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
-    """Start the plan's discovery server, or wait for the one of another machine if not `ours`.
+async def begin(system: System, spawner: ForkServer) -> None:
+    """Start the plan's discovery server, or wait for the one of another machine.
 
     Raises:
         StepFailedError: it cannot be started or ended again, or does not listen in time.
@@ -54,7 +55,7 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
     planned = system.plan.server
     if planned is None:
         return
-    if not ours:
+    if planned.machine not in own_machines(system.plan, system.run.options.machine):
         await _until_it_listens(planned, None)
         return
     if discovery_server_listens(planned):

@@ -207,7 +207,7 @@ participant, its authority and the networks that it programs."""
 _NOT_CHANGEABLE = ("policy.ros_interface",)
 
 
-def check(order: Order, system: System, machine: str) -> None:
+def check(order: Order, system: System) -> None:
     """Make sure that nothing but the manifest that an order means will run.
 
     Raises:
@@ -220,7 +220,7 @@ def check(order: Order, system: System, machine: str) -> None:
                 f"cannot apply a manifest to {running.system!r} without one, or within "
                 f"{order.timeout_s:g} s"
             )
-        _check_apply(order.plan, system, machine)
+        _check_apply(order.plan, system)
     elif order.plan is not None:
         found = changes(running, order.plan)
         if found and order.ask is not ControlRequest.PAUSE:
@@ -246,9 +246,9 @@ def _refused(order: Order, system: System, found: Iterable[PlanDifference]) -> U
     )
 
 
-def _check_apply(plan: Plan, system: System, machine: str) -> None:
+def _check_apply(plan: Plan, system: System) -> None:
     """Make sure that the running system can become that of another plan."""
-    running = system.first
+    running, machine = system.first, system.run.options.machine
     what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
     if not _is_whole(plan):
         raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")

@@ -23,8 +23,7 @@ from lifecycle.printable import one_line
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.core.state import Step, limit_of
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.run.events import Failure, Notice
-from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.events import Failure, Notice, StepFailedError
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import START_FAILED

@@ -64,19 +64,13 @@ class SilenceMonitor:
 
     Args:
         emit: where events go.
-        changed: called whenever a node fell silent or came back: time to judge again.
         is_there: whether a node has started, and is in the graph as far as that is known.
     """
 
-    def __init__(
-        self,
-        emit: Emitter,
-        changed: Callable[[], None],
-        is_there: Callable[[str], bool] = lambda _: True,
-    ) -> None:
+    def __init__(self, emit: Emitter, is_there: Callable[[str], bool] = lambda _: True) -> None:
         self._emit = emit
         self._is_there = is_there
-        self._listeners = [changed]
+        self._listeners: list[Callable[[], None]] = []
         self._silent: dict[str, _Silence] = {}
         self._unanswering: dict[str, Finding] = {}
 

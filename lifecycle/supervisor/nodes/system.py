@@ -232,7 +232,7 @@ class System:
         logs: likewise, with what could not be written there.
         adopted: the nodes that ran before it, by full name, with the process that each is in as
             people read it, empty where that is not known; None if none is to be adopted.
-        on_change: called whenever something is not as it was judged: time to judge again.
+        touch: called whenever something may be other than it was judged: time to judge again.
         on_health: likewise with a node that may be as healthy as others wait for.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
@@ -264,10 +264,10 @@ class System:
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name: dict[str, NodeRun] = {}
         self.adopted: dict[str, str] | None = None
-        self.on_change: Callable[[], None] = lambda: None
+        self.touch: Callable[[], None] = lambda: None
         self.on_health: Callable[[NodeRun], None] = lambda _: None
         self.present: frozenset[str] | None = None
-        self.liveliness = SilenceMonitor(emit, self.touch, self._is_there)
+        self.liveliness = SilenceMonitor(emit, self._is_there)
         self.follow()
 
     @property
@@ -279,10 +279,6 @@ class System:
     def first(self) -> Plan:
         """As it was made from the manifest in force, without what became of it since."""
         return self.run.first
-
-    def touch(self) -> None:
-        """Note that something may be other than it was judged."""
-        self.on_change()
 
     def follow(self) -> None:
         """Have nodes and processes be those of the run, as another manifest has others."""

@@ -1,1 +1,1 @@
-"""The processes of a system: fork server, control channel, logs, run directory, orphans."""
+"""The processes of a system: fork server, control channel, logs, what they leave behind."""

@@ -271,7 +271,7 @@ class ForkServer:
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
         elif child is not None and report.status is not None:
-            self._settle(report.id, ProcessExit.from_wait(report.status))
+            self._settle(report.id, ProcessExit.of(report.status))
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
         born, process = self._pending.pop(report.id)
@@ -296,9 +296,8 @@ class ForkServer:
         with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
             found = os.waitid(os.P_PIDFD, child.pidfd, os.WEXITED | os.WNOHANG)
         if found is not None:
-            is_exit = found.si_code == os.CLD_EXITED
-            kind = {"status" if is_exit else "signal": found.si_status}
-            self._settle(number, ProcessExit(**kind))
+            sign = 1 if found.si_code == os.CLD_EXITED else -1
+            self._settle(number, ProcessExit.of(sign * found.si_status))
         elif patience_s > 0:
             self._loop.call_later(patience_s, self._gone, number, 0.0)
         else:
@@ -314,10 +313,9 @@ class ForkServer:
         """The fork server itself has ended: by now its children are ours."""
         self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
-        status = self._process.popen.wait()
+        end = ProcessExit.of(self._process.popen.wait())
         self._reports()
-        exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
-        self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
+        self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {end}")
         self._serves.set()
         for born, _ in self._pending.values():
             if not born.done():

@@ -76,7 +76,7 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         id: of the ForkRequest; 0 answers SERVES.
         pid: of the child; 0 if it could not be forked.
-        status: waitpid(2) status; None while it runs.
+        status: exit code, below 0 for a signal; None while it runs.
         error: why it could not be forked.
         stopped: a signal stopped it (True) or made it continue (False); None reports neither.
     """
@@ -236,7 +236,7 @@ class _ForkServer:
                 request = self._children.get(pid) if lives else self._children.pop(pid, None)
                 if request is not None:
                     stopped = os.WIFSTOPPED(status) if lives else None
-                    ended = None if lives else status
+                    ended = None if lives else os.waitstatus_to_exitcode(status)
                     self._tell(ChildReport(id=request.id, pid=pid, status=ended, stopped=stopped))
 
     def _tell(self, report: ChildReport, *descriptors: int) -> None:

@@ -53,9 +53,8 @@ class ProcessExit(msgspec.Struct, frozen=True, kw_only=True):
     signal: int | None = None
 
     @classmethod
-    def from_wait(cls, raw: int) -> ProcessExit:
-        """Decode the status of waitpid(2)."""
-        code = os.waitstatus_to_exitcode(raw)
+    def of(cls, code: int) -> ProcessExit:
+        """Return what an exit code says, as `subprocess` has it: below 0 for a signal."""
         return cls(status=code) if code >= 0 else cls(signal=-code)
 
     @property

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from lifecycle.errors import BringUpError
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
 from lifecycle.verify.verdict import Stage, Verdict
@@ -226,6 +227,14 @@ class Failure(Event, frozen=True, kw_only=True, tag="failure"):
     process: str = ""
     log: str = ""
     ends_run: bool = True
+
+
+class StepFailedError(BringUpError):
+    """A step of bring-up failed that is no request to a node; `failure` is all of it."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(failure.message)
+        self.failure = failure
 
 
 class RestartScheduled(Event, frozen=True, kw_only=True, tag="backoff"):

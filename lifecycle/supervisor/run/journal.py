@@ -17,7 +17,7 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -81,39 +81,29 @@ class JournalLine(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Journal:
-    """Writes a run's journal; what cannot be written is said once, and is missing there."""
+    """Writes a run's journal; what cannot be written is said once, and is missing there.
+
+    It is beside the logs of the run, in a directory that is made with the first event.
+    """
 
     def __init__(
-        self,
-        system: str,
-        run_id: str,
-        *,
-        say: Callable[[str], None],
+        self, directory: Path, system: str, run_id: str, *, say: Callable[[str], None]
     ) -> None:
         self._run = JournaledRun(
             journal_version=1, system=system, run_id=run_id, supervisor=os.getpid()
         )
         self._say = say
         self._began = time.monotonic()
-        self._waiting: list[bytes] = []
-        self._file: RotatedFile | None = None
-
-    @contextlib.contextmanager
-    def writing(self, directory: Path) -> Iterator[None]:
-        """Write into the directory of the run's logs meanwhile; what came before waits for it."""
         self._file = RotatedFile(
             directory / JOURNAL_NAME,
             LARGEST_JOURNAL,
             mode=0o600,
             head=lambda: self._line(run=self._run),
         )
-        for line in self._waiting:
-            self._write(self._file, line)
-        try:
-            yield
-        finally:
-            self._file.close()
-            self._file = None
+
+    def close(self) -> None:
+        """Close its file; the run is over."""
+        self._file.close()
 
     def on_event(self, event: Event) -> None:
         """Note an event; a listener of the run."""
@@ -122,24 +112,18 @@ class Journal:
         if isinstance(event, VerdictChanged):
             verdict = replace(event.verdict, flows=(), open_endpoints=())
             event = replace(event, verdict=verdict)
-        line = self._line(event=event)
-        if self._file is None:
-            self._waiting.append(line)
-        else:
-            self._write(self._file, line)
+        file = self._file
+        failed = file.error is not None
+        if not file.add(self._line(event=event)) and not failed and file.error is not None:
+            self._say(
+                f"cannot write {str(file.path)!r}: {file.error.strerror}; the run goes on, "
+                "and what happens meanwhile is missing there"
+            )
 
     def _line(self, **content: object) -> bytes:
         elapsed_s = round(time.monotonic() - self._began, 6)
         now = {"at": round(time.time(), 6), "elapsed_s": elapsed_s}
         return codec.to_json({**now, **content}) + b"\n"
-
-    def _write(self, file: RotatedFile, line: bytes) -> None:
-        failed = file.error is not None
-        if not file.add(line) and not failed and file.error is not None:
-            self._say(
-                f"cannot write {str(file.path)!r}: {file.error.strerror}; the run goes on, "
-                "and what happens meanwhile is missing there"
-            )
 
 
 class Moment(msgspec.Struct, frozen=True, kw_only=True):

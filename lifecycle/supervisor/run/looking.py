@@ -238,15 +238,7 @@ def _judged(
     may_be_over: bool = True,
     unanswered: Iterable[str] = (),
 ) -> JudgedSystem:
-    """Judge what was seen.
-
-    Args:
-        plan: what was declared.
-        observation: what was seen.
-        observer_participant: by which.
-        may_be_over: whether a node that may end by itself, and is not there, has ended.
-        unanswered: names of nodes that answered no request.
-    """
+    """Judge what was seen; a node that may end by itself, and is not there, may have ended."""
     expected, unconnected = expected_by_onlooker(plan, observation)
     over = {each.full_name: "" for each in expected.nodes if each.may_end and may_be_over}
     verdict = verify(expected, observation, stage=Stage.ACTIVE, over=over)

@@ -43,7 +43,6 @@ from lifecycle.middleware.rcl.conversions import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
-from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (
     FORK_SERVER,
     RunDirectory,
@@ -56,6 +55,7 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
+from lifecycle.supervisor.control.status import ended_early
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
 from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
@@ -70,8 +70,8 @@ from lifecycle.supervisor.run.events import (
     Listener,
     Notice,
     RunStarted,
+    StepFailedError,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, ended_early
 from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     UpOptions,
@@ -95,9 +95,6 @@ Where it is made, Fast DDS may wait for ever for threads that it cannot have."""
 
 THREADS = 24
 """A supervisor has up to 16, most of them its participant's."""
-
-OBSERVER_TRIES = 4
-
 
 Conclude = Callable[[UpResult], ExitCode]
 
@@ -142,15 +139,15 @@ def up(
     emit.listen(guarded)
     emit.listen(service.on_event)
     _preload(process, plan, processes)
+    logs = log_directory(os.environ, plan.system)
     directory = RunDirectory.acquire(
         runtime_root(os.environ),
         run_name(plan, options.machine),
         process.run_id,
-        domain_id=plan.domain_id,
         processes={process.popen.pid: FORK_SERVER},
     )
     journal = Journal(
-        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
+        logs, plan.system, directory.run_id, say=lambda text: emit(Notice(message=text))
     )
     emit.listen(journal.on_event)
     try:
@@ -163,7 +160,6 @@ def up(
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             leaving.callback(service.watch())
-            logs = log_directory(os.environ, plan.system)
             begin_logs(os.environ, logs, plan.system)
             system = System(
                 plan,
@@ -174,12 +170,11 @@ def up(
                 # What a fork server that was started before `_enter_graph` has to pass on.
                 variables=tuple((n, os.environ[n]) for n in _GRAPH_VARIABLES if n in os.environ),
             )
-            leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
-                    await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
+                    await discovery_server.begin(system, fork_server)
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 emit(_started(system, observer_participant, str(logs)))
@@ -209,6 +204,7 @@ def up(
         process.close()
         # Once our own participant is gone, too.
         sweep(within_s=_LET_GO_S)
+        journal.close()
         directory.release()
     guarded.check()
     return result
@@ -295,18 +291,10 @@ async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) 
         await asyncio.sleep(_INTERFACE_S)
 
 
-def _serves(plan: Plan, options: UpOptions) -> bool:
-    server = plan.server
-    return server is not None and server.machine in own_machines(plan, options.machine)
-
-
 async def _observer_participant(
     plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
 ) -> ObserverParticipant:
-    """Make the supervisor's participant; on another port if a discovery server is not reached.
-
-    Fast DDS may never use the first connection to it (middleware/fastdds/sockets.py).
-    """
+    """Make the supervisor's participant."""
     with ending.raised():
         await _until_interface_is_up(plan, options, emit)
     # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
@@ -316,31 +304,24 @@ async def _observer_participant(
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
-    planned = connections = observer_connections(plan, options.machine)
-    for number in range(OBSERVER_TRIES):
-        with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
-            observer_participant = ObserverParticipant.open(
-                plan.domain_id,
-                connections,
-                unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
-                events=wires and (dynamic or layer.events),
-                settle_s=plan.discovery.settle_s,
-            )
-        if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
-            break
+    with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
+        observer_participant = ObserverParticipant.open(
+            plan.domain_id,
+            observer_connections(plan, options.machine),
+            unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
+            events=wires and (dynamic or layer.events),
+            settle_s=plan.discovery.settle_s,
+        )
+    discovery = observer_participant.discovery
+    if not discovery.reaches_servers():
         observer_participant.destroy()
-        connections = moved_observer(plan, planned, number)
-        emit(
-            Notice(
-                message="the supervisor's own participant is made again on a fresh port: the "
-                "discovery server did not take its connection; "
-                f"try {number + 1} of {OBSERVER_TRIES - 1}"
-            )
+        raise MiddlewareError(
+            "cannot see the graph: the discovery server did not take this supervisor's connection",
+            hint="start it again: Fast DDS 2.14 may never use a connection that it has made",
         )
     # Nodes elsewhere would be found: they answer to ports of ours.
-    discovery = observer_participant.discovery
     port = None
-    if local_processes(plan, options.machine):
+    if plan.processes:
         port = missing_port(discovery.domain_id, discovery.urls, os.environ)
     if port is not None:
         observer_participant.destroy()

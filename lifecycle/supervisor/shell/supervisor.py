@@ -28,7 +28,7 @@ from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check
-from lifecycle.supervisor.control.status import process_state, system_status
+from lifecycle.supervisor.control.status import process_state, result_of, system_status
 from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
@@ -45,9 +45,9 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     Notice,
     ProcessChanged,
+    StepFailedError,
     Stopped,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, result_of
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
@@ -147,8 +147,9 @@ class Supervisor:
             messages.Answer: self._answer,
             messages.Wake: self._wake_at,
         }
-        system.on_change = self._touch
+        system.touch = self._touch
         system.on_health = self._health
+        system.liveliness.listen(self._touch)
         system.liveliness.listen(self._silence)
 
     # What others ask
@@ -177,7 +178,7 @@ class Supervisor:
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
-            check(order, self.system, self.system.run.options.machine)
+            check(order, self.system)
         except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
         run, change = self.system.run, None

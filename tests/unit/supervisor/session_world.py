@@ -465,7 +465,7 @@ class SessionWorld(World):
         self._stopping_at_s: float | None = None
         self._tmp_path = tmp_path
         self.emit.listen(self._take)
-        self.journal = Journal("robot", "0", say=self.story.append)
+        self.journal = Journal(tmp_path / "logs", "robot", "0", say=self.story.append)
         self.emit.listen(self.journal.on_event)
         for node in plan.nodes:
             if node.run.kind is RunKind.ATTACH:
@@ -500,8 +500,7 @@ class SessionWorld(World):
 
     async def run(self) -> None:
         """Run the session to its end."""
-        kept = self.journal.writing(self._tmp_path / "logs")
-        with self.ending, self._run_directory() as directory, kept:
+        with self.ending, self._run_directory() as directory:
             means = Means(
                 directory=directory,
                 fork_server=self.hosts,

@@ -35,7 +35,7 @@ class Kept:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.said: list[str] = []
-        self.journal = Journal("robot", "42", say=self.said.append)
+        self.journal = Journal(directory, "robot", "42", say=self.said.append)
 
     def say(self, message: str) -> None:
         self.journal.on_event(Notice(message=message))
@@ -48,8 +48,8 @@ class Kept:
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Kept]:
     made = Kept(tmp_path)
-    with made.journal.writing(tmp_path):
-        yield made
+    yield made
+    made.journal.close()
 
 
 def test_every_line_is_as_the_schema_says(kept: Kept) -> None:

@@ -15,8 +15,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
-from lifecycle.supervisor.run.events import Event
-from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.events import Event, StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeForkServer, World
@@ -57,7 +56,7 @@ async def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_ru
 
     system, spawner = world(served(port), tmp_path)
     with pytest.raises(StepFailedError) as caught:
-        await discovery_server.begin(system, spawner, ours=True)
+        await discovery_server.begin(system, spawner)
     assert system.server is None
     assert caught.value.message == (
         f"cannot start the discovery server at tcp 127.0.0.1:{port}: that port is not free on "
@@ -69,7 +68,7 @@ async def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> No
     system, spawner = world(served(nobody), tmp_path)
     spawner.changed = lambda: spawner.processes["discovery_server"].end(ProcessExit(status=1))
     with pytest.raises(StepFailedError) as caught:
-        await discovery_server.begin(system, spawner, ours=True)
+        await discovery_server.begin(system, spawner)
     said: list[Event] = []
     system.emit.listen(said.append)
     for _ in range(2):
@@ -91,7 +90,7 @@ async def test_the_server_of_another_machine_is_waited_for_with_a_deadline(
 
     system, spawner = world(served(nobody, "base"), tmp_path)
     with pytest.raises(StepFailedError) as caught:
-        await discovery_server.begin(system, spawner, ours=False)
+        await discovery_server.begin(system, spawner)
     assert caught.value.failure.rule == "run.deadline"
     assert caught.value.message == (
         "cannot reach the discovery server of machine 'base', whose supervisor starts it, at "
@@ -105,7 +104,7 @@ async def test_the_server_of_another_machine_may_come_later(
 ) -> None:
     listener.listen()
     system, spawner = world(served(listener.getsockname()[1], "base"), tmp_path)
-    await discovery_server.begin(system, spawner, ours=False)
+    await discovery_server.begin(system, spawner)
     assert system.server is None
     assert spawner.processes == {}
 

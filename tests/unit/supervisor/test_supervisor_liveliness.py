@@ -27,7 +27,8 @@ class Ears:
         self.changes = 0
         emit = Emitter()
         emit.listen(self.events.append)
-        self.liveliness = SilenceMonitor(emit, self._changed)
+        self.liveliness = SilenceMonitor(emit)
+        self.liveliness.listen(self._changed)
 
     def _changed(self) -> None:
         self.changes += 1

@@ -100,13 +100,13 @@ async def test_a_manifest_that_a_running_supervisor_cannot_take_is_refused_with_
     system = World(PLAN, tmp_path).system
     given = Order(ask=ControlRequest.APPLY, plan=replace(PLAN, **changed))
     with pytest.raises(UsageError) as refused:
-        check(given, system, "")
+        check(given, system)
     what = "cannot apply robot.lifecycle.yaml to 'robot' while it runs"
     assert str(refused.value).startswith(f"{what}: {why}")
     # What no command line sends is refused, too.
     for each in (Order(ask=ControlRequest.APPLY), replace(given, timeout_s=-1.0)):
         with pytest.raises(UsageError, match="cannot apply a manifest to 'robot' without one"):
-            check(each, system, "")
+            check(each, system)
 
 
 def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:

@@ -60,7 +60,8 @@ class Robot(World):
         own = [each for each in plan.processes if each.name not in elsewhere]
         super().__init__(plan, directory, processes=own)
         self.touched = asyncio.Event()
-        self.system.on_change = self.touched.set
+        self.system.touch = self.touched.set
+        self.system.liveliness.listen(self.touched.set)
         self.air = FakeAir()
         self.peers = Peers(self.system, self.air)
         self.peers.open()

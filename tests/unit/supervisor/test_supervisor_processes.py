@@ -245,7 +245,6 @@ def _record(run_id: str, *children: ChildRecord, boot: str = "") -> RunRecord:
     return RunRecord(
         run_id=run_id,
         boot_id=boot or boot_id(),
-        began_s=0.0,
         supervisor=ChildRecord(name="supervisor", pid=1, start_ticks=1),
         children=children,
     )
