@@ -112,6 +112,11 @@ class TopicMeasurements:
                 except MiddlewareError as error:
                     _logger.warning("cannot measure %s: %s", topic, error)
 
+    def begin_anew(self) -> None:
+        """Forget what was counted: messages waited while this process stood still."""
+        for each in self._topics.values():
+            each.since_ns, each.counter = time.monotonic_ns(), None
+
     def measured(self) -> Measured | None:
         """Return what was counted until now; None where nothing is measured so."""
         if not self._topics:

@@ -223,6 +223,7 @@ class Looks:
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
             self._graph.discovery.settling.expect_newcomers(everybody=True)
+            self._graph.measure_anew()
         system = self._system
         await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
         seen = await self._graph.observe(self._plan_asked(), machines=system.machines)
