@@ -40,6 +40,7 @@ class _Listening(msgspec.Struct):
         type: of the topic.
         qos: as it was asked for.
         since_ns: on the monotonic clock.
+        fails: it could not be made.
         counter: from its first message on.
     """
 
@@ -47,6 +48,7 @@ class _Listening(msgspec.Struct):
     qos: QosProfile
     is_apart: bool
     since_ns: int
+    fails: bool = False
     counter: Counter | None = None
 
     def arrived(self, _: bytes, info: Mapping[str, int]) -> None:
@@ -61,7 +63,8 @@ class _Listening(msgspec.Struct):
         if self.counter is not None:
             return self.counter.sample(now_ns)
         seconds = (now_ns - self.since_ns) / 1e9
-        return Sample(seconds=seconds, silent_s=max(0.0, seconds - _DISCOVERED_S))
+        silent_s = 0.0 if self.fails else max(0.0, seconds - _DISCOVERED_S)
+        return Sample(seconds=seconds, silent_s=silent_s)
 
 
 class TopicMeasurements:
@@ -110,6 +113,7 @@ class TopicMeasurements:
                 try:
                     self._clients.on_messages(topic, type_, qos, of.arrived)
                 except MiddlewareError as error:
+                    of.fails = True
                     _logger.warning("cannot measure %s: %s", topic, error)
 
     def begin_anew(self) -> None:
