@@ -262,6 +262,10 @@ class Graph:
             measured=self._measurements.measured(),
         )
 
+    def measure_anew(self) -> None:
+        """Forget what was counted of topics that this process measures."""
+        self._measurements.begin_anew()
+
     def drop_configuration(self, node: str) -> None:
         """Forget what a node said of itself whose process ended."""
         self.state.drop_configuration(node)

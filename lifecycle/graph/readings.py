@@ -313,6 +313,7 @@ class _Listening(msgspec.Struct):
         type: of the topic.
         qos: as it was asked for.
         since_ns: on the monotonic clock.
+        fails: it could not be made.
         counter: from its first message on.
     """
 
@@ -320,6 +321,7 @@ class _Listening(msgspec.Struct):
     qos: QosProfile
     is_apart: bool
     since_ns: int
+    fails: bool = False
     counter: Counter | None = None
 
     def arrived(self, _: bytes, info: Mapping[str, int]) -> None:
@@ -334,7 +336,8 @@ class _Listening(msgspec.Struct):
         if self.counter is not None:
             return self.counter.sample(now_ns)
         seconds = (now_ns - self.since_ns) / 1e9
-        return Sample(seconds=seconds, silent_s=max(0.0, seconds - _DISCOVERED_S))
+        silent_s = 0.0 if self.fails else max(0.0, seconds - _DISCOVERED_S)
+        return Sample(seconds=seconds, silent_s=silent_s)
 
 
 class TopicMeasurements:
@@ -383,7 +386,13 @@ class TopicMeasurements:
                 try:
                     self._clients.on_messages(topic, type_, qos, of.arrived)
                 except MiddlewareError as error:
+                    of.fails = True
                     _logger.warning("cannot measure %s: %s", topic, error)
+
+    def begin_anew(self) -> None:
+        """Forget what was counted: messages waited while this process stood still."""
+        for each in self._topics.values():
+            each.since_ns, each.counter = time.monotonic_ns(), None
 
     def measured(self) -> Measured | None:
         """Return what was counted until now; None where nothing is measured so."""

@@ -258,9 +258,11 @@ def check_numbers(system: DeclaredSystem) -> Iterator[Diagnostic]:
     for link in system.manifest.links:
         yield from _alone(link)
         asked.setdefault(link.topic, []).extend(link.quantities)
-    for topic, numbers in published.items():
+    for topic in {**published, **asked}:
         if len(system.named(EndpointKind.PUBLISHER, topic)) == 1:  # several may add up
-            yield from _together(numbers, asked.get(topic, ()))
+            of_topic = published.get(topic, ()), asked.get(topic, ())
+            yield from _together(*of_topic)
+            yield from _each_other(*of_topic)
 
 
 def _alone(declared: FlowNeed | Link) -> Iterator[Diagnostic]:
@@ -292,6 +294,20 @@ def _together(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Itera
         if silence.value < period_s:
             message = f"cannot keep {silence}: {where}, one message in {period_s:.3g} s"
             yield error(_NUMBER, silence.at, message)
+
+
+def _each_other(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Iterator[Diagnostic]:
+    """Compare what the data of a topic are to be in one place with the same in another."""
+    for limit in _named("rate_hz", asked):
+        if limit.most is None or limit.most < limit.value:
+            continue
+        where = f"{limit} is asked for, too ({limit.at.spelled})"
+        for rate in _named("rate_hz", asked):
+            if rate is not limit and rate.value * (1 - rate.slack) > limit.most:
+                yield error(_RULE, rate.at, f"cannot keep {rate}: {where}")
+        for silence in _named("max_silence_s", (*published, *asked)):
+            if silence.value * limit.most < 1:
+                yield error(_RULE, silence.at, f"cannot keep {silence}: {where}")
 
 
 def _named(name: str, numbers: Iterable[Quantity]) -> Iterator[Quantity]:

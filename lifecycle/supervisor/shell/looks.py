@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
-from lifecycle.manifest.model import Condition
+from lifecycle.manifest.model import Condition, EndpointKind
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan, PlannedNode
@@ -216,6 +216,7 @@ class Looks:
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
             self._graph.discovery.settling.expect_newcomers(everybody=True)
+            self._graph.measure_anew()
         system = self._system
         await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
         seen = await self._graph.observe(self._plan_asked(), machines=system.machines)
@@ -271,15 +272,22 @@ class Looks:
         ours = {each.name for each in self._system.nodes.values() if each.is_hosted}
         states = {each.full_name: each.state for each in observation.nodes}
         states |= {each.name: each.state for each in observation.configurations}
-        prefixes = {each.node: each.gid[:PREFIX_DIGITS] for each in observation.endpoints}
+        participants: dict[str, set[str]] = {}
+        for end in observation.endpoints:
+            if end.kind is EndpointKind.PUBLISHER:
+                participants.setdefault(end.node, set()).add(end.gid[:PREFIX_DIGITS])
         now_s = asyncio.get_running_loop().time()
         active = [
-            (name, prefixes.get(name, ""))
+            (name, prefix)
             for name in (each.full_name for each in self._system.plan.nodes)
             if name not in ours and states.get(name, "absent") in (None, "", ACTIVE)
+            for prefix in participants.get(name, {""})
         ]
         self._active = {each: self._active.get(each, now_s) for each in active}
-        times = tuple((name, now_s - since_s) for (name, _), since_s in self._active.items())
+        since_s: dict[str, float] = {}
+        for (name, _), seen_s in self._active.items():
+            since_s[name] = max(seen_s, since_s.get(name, seen_s))
+        times = tuple((name, now_s - each) for name, each in since_s.items())
         return replace(observation, active_s=times)
 
     def _plan_asked(self) -> Plan:

@@ -169,7 +169,7 @@ def test_data_are_measured_anew_after_each_order_and_what_was_before_is_no_fault
         run.until_found("flow.rate", SUBJECT)
 
 
-def test_a_source_of_others_is_measured_anew_when_it_is_started_again_or_has_another_qos(
+def test_what_others_publish_is_measured_anew_after_a_restart_another_qos_and_a_standstill(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     def changed(reliability: str) -> Path:
@@ -201,6 +201,10 @@ def test_a_source_of_others_is_measured_anew_when_it_is_started_again_or_has_ano
         time.sleep(4.0)
         applied = verb("apply", str(changed("BEST_EFFORT")), runtime=tmp_path)
         assert applied.returncode == ExitCode.OK, applied.stderr
+        time.sleep(4.0)
+        run.signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        run.signal(signal.SIGCONT)
         time.sleep(4.0)
         run.catch_up()
         for verdict in (each["verdict"] for each in run.of_kind("verdict")[since:]):

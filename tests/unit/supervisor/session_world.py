@@ -256,6 +256,9 @@ class FakeParticipant(FakeAir):
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         self._reports[configuration.name] = configuration
 
+    def measure_anew(self) -> None:
+        """Nothing is measured here."""
+
     def drop_configuration(self, node: str) -> None:
         self.dropped.append(node)
         self._reports.pop(node, None)
