@@ -304,10 +304,10 @@ def _each_other(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Ite
         where = f"{limit} is asked for, too ({limit.at.spelled})"
         for rate in _named("rate_hz", asked):
             if rate is not limit and rate.value * (1 - rate.slack) > limit.most:
-                yield error(_RULE, rate.at, f"cannot keep {rate}: {where}")
+                yield error(_NUMBER, rate.at, f"cannot keep {rate}: {where}")
         for silence in _named("max_silence_s", (*published, *asked)):
             if silence.value * limit.most < 1:
-                yield error(_RULE, silence.at, f"cannot keep {silence}: {where}")
+                yield error(_NUMBER, silence.at, f"cannot keep {silence}: {where}")
 
 
 def _named(name: str, numbers: Iterable[Quantity]) -> Iterator[Quantity]:
