@@ -44,6 +44,9 @@ class Container(Node):
         self._runs = executor
         self._nodes: dict[int, Node] = {}
         self._loaded = 0
+        # A node that was destroyed and its service of type descriptions are in a cycle: the service
+        # stays until that is collected, which its executor allows once it has gone on.
+        self.create_timer(0.1, gc.collect)
         self.create_service(ListNodes, "~/_container/list_nodes", self._list)
         changing = (
             self.create_service(LoadNode, "~/_container/load_node", self._load),
@@ -83,8 +86,6 @@ class Container(Node):
         name = node.get_fully_qualified_name()
         self._runs.remove_node(node)
         node.destroy_node()
-        del node
-        gc.collect()  # rclpy's service of type descriptions is in a cycle, and stays until then
         print(f"unloaded {name}", flush=True)
         return respond(response, success=True, error_message="", unique_id=0)
 
