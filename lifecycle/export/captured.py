@@ -20,7 +20,6 @@ from lifecycle.export.programs import (
     process_names,
     run_of,
 )
-from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue, TargetState
 from lifecycle.manifest.names import (
     free_name,
@@ -29,6 +28,7 @@ from lifecycle.manifest.names import (
     namespace_problem,
     node_name_problem,
 )
+from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.manifest.qos import History, QosProfile
 from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
 from lifecycle.verify.observation import (

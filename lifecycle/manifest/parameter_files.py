@@ -23,20 +23,12 @@ import msgspec
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
 from lifecycle.manifest.model import Node, ParameterValue
 from lifecycle.manifest.names import namespace_problem, node_name_problem
+from lifecycle.manifest.parameter_values import SCALARS, type_of
 from lifecycle.manifest.yaml.document import INT64_MAX, INT64_MIN, not_finite, quote, spell_place
 from lifecycle.manifest.yaml.source import MAX_VALUES, decode, events, read_bytes
 
 if TYPE_CHECKING:
     import yaml
-
-_SCALARS = {bool: "bool", int: "int", float: "double", str: "string"}
-
-
-def type_of(value: ParameterValue) -> str:
-    """Return a value's type, `int`, `string_array`; `array` for an empty array, which fits all."""
-    if isinstance(value, tuple):
-        return f"{_SCALARS[type(value[0])]}_array" if value else "array"
-    return _SCALARS[type(value)]
 
 
 def _spellings(word: str) -> tuple[str, str, str]:
@@ -211,7 +203,7 @@ class _Parameters(msgspec.Struct):
         self.names[index], self.places[index] = name, at
 
 
-_BY_TYPE = tuple(f"{each}{array}" for array in ("", "_array") for each in _SCALARS.values())
+_BY_TYPE = tuple(f"{each}{array}" for array in ("", "_array") for each in SCALARS.values())
 """A parameter that is given values of several types has the first of these."""
 
 

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Findings, Position, error, note, warning
 from lifecycle.manifest.model import (
     SIM_TIME,
@@ -26,6 +25,7 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.manifest.parameter_files import ParameterFiles
+from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.manifest.written import read
 from lifecycle.manifest.yaml.document import YAML_1_1_BOOLEANS, Document, has_leading_zero, quote
 

@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter
 from lifecycle.errors import BringUpError, LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
-from lifecycle.manifest.parameter_files import type_of
+from lifecycle.manifest.parameter_values import type_of
 from lifecycle.middleware.rcl.conversions import (
     PARAMETER_TYPES,
     parameter_to_rclpy,

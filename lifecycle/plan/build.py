@@ -41,6 +41,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import name_in_graph
 from lifecycle.manifest.parameter_files import ParameterFiles
+from lifecycle.manifest.parameter_values import portable
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
@@ -55,7 +56,7 @@ from lifecycle.plan.model import (
     declared,
     in_mode,
 )
-from lifecycle.plan.parameters import NodeParameters, portable
+from lifecycle.plan.parameters import NodeParameters
 from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
 from lifecycle.plan.wiring import wire

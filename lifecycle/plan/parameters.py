@@ -8,7 +8,6 @@ and of those that match a node the later wins. `-p` goes into the section `/**`.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -17,20 +16,17 @@ from lifecycle.manifest.checks.parameters import (
     CommandParameter,
     command_line_parameters,
     given_value,
-    misfit,
 )
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, Node, ParameterDeclaration, ParameterValue
-from lifecycle.manifest.parameter_files import ParameterFiles, type_of
+from lifecycle.manifest.parameter_files import ParameterFiles
+from lifecycle.manifest.parameter_values import as_type, misfit, portable, type_of
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
 GIVEN = "parameters"
 COMMAND = "command"
 DEFAULT = "default_value"
 """Sources of a value, as the manifest spells them; the fourth kind is a file's name."""
-
-NOT_FINITE = (".nan", ".inf", "-.inf")
-"""Doubles that JSON has no numbers for, as YAML spells them."""
 
 
 class _Given(NamedTuple):
@@ -149,32 +145,3 @@ def _expected(name: str, type_: str, given: _Given) -> ExpectedParameter:
         optional=given.optional,
         at=given.at,
     )
-
-
-def as_type(value: ParameterValue, type_: str) -> ParameterValue:
-    """Return `value` as a parameter of `type_` has it: YAML writes 5 where a double is meant."""
-    if type_.removesuffix("_array") != "double":
-        return value
-    if isinstance(value, tuple):
-        return tuple(float(each) if _is_int(each) else each for each in value)
-    return float(value) if _is_int(value) else value
-
-
-def portable(value: ParameterValue) -> ParameterValue:
-    """Return `value` so that JSON can carry it: doubles that are not finite become text."""
-    if isinstance(value, tuple):
-        return tuple(_portable(each) for each in value)
-    return _portable(value)
-
-
-def _portable(value: bool | float | str) -> bool | int | float | str:
-    if isinstance(value, float) and not math.isfinite(value):
-        return NOT_FINITE[0 if math.isnan(value) else 1 if value > 0 else 2]
-    if isinstance(value, str):
-        # A lone surrogate, which Python has and UTF-8 has not.
-        return value.encode("utf-8", "backslashreplace").decode("utf-8")
-    return value
-
-
-def _is_int(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)

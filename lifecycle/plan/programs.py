@@ -19,9 +19,9 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
+from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.processes import find_executable
 from lifecycle.plan.python_source import (

@@ -16,15 +16,14 @@ import msgspec
 
 from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
-from lifecycle.manifest.checks.parameters import misfit
 from lifecycle.manifest.model import EndpointKind, ParameterValue, Readiness
 from lifecycle.manifest.names import topic_of
+from lifecycle.manifest.parameter_values import as_type, misfit, portable
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.parameters import as_type, portable
 from lifecycle.verify.outcome import ConnectionReport
 
 LONGEST_CONFIGURATION = 1 << 22

@@ -29,7 +29,8 @@ from lifecycle.manifest.names import (
     parse_rule,
     resolve,
 )
-from lifecycle.manifest.parameter_files import read_parameter_file, type_of
+from lifecycle.manifest.parameter_files import read_parameter_file
+from lifecycle.manifest.parameter_values import type_of
 from lifecycle.manifest.qos import (
     INFINITE_NS,
     PRESETS,

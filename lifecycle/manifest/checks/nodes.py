@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Iterable, Iterator
 
 from lifecycle.errors import did_you_mean
-from lifecycle.manifest.checks.parameters import is_implicit, misfit, suggestion
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
 from lifecycle.manifest.model import (
@@ -33,6 +32,7 @@ from lifecycle.manifest.names import (
     name_problem,
     topic_of,
 )
+from lifecycle.manifest.parameter_values import is_implicit, misfit, suggestion
 
 
 def check_machines(system: DeclaredSystem) -> Iterator[Diagnostic]:

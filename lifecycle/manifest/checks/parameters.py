@@ -1,7 +1,7 @@
 """Checks of ROS parameters and parameter files (YAML) against the parameters an interface declares.
 
-Owns: whether a value fits a type of rcl_interfaces/ParameterType; what a command line sets of
-parameters. An interface that declares no parameters leaves them open: nothing is checked then.
+Owns: what a command line sets of parameters. An interface that declares no parameters leaves them
+open: nothing is checked then.
 """
 
 from __future__ import annotations
@@ -20,52 +20,8 @@ from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKin
 from lifecycle.manifest.parameter_files import (
     ParameterFile,
     read_scalar,
-    type_of,
 )
-from lifecycle.manifest.yaml.document import quote
-
-_IMPLICIT = ("use_sim_time", "start_type_description_service")
-
-
-def is_implicit(name: str) -> bool:
-    """Whether ROS declares this parameter itself, in every node or for every topic."""
-    return name in _IMPLICIT or name.startswith("qos_overrides.")
-
-
-def misfit(value: ParameterValue, declared: str) -> str:
-    """Return how a value fails its declared type, to follow "cannot set … to "; empty if it fits.
-
-    ROS converts nothing: an integer for a double ends the node when it declares the parameter.
-    """
-    given = type_of(value)
-    bytes_given = declared == "byte_array" and given == "int_array"
-    if given == declared or (given == "array" and declared.endswith("_array")):
-        return ""
-    if bytes_given and isinstance(value, tuple):
-        if all(isinstance(each, int) and 0 <= each <= 0xFF for each in value):
-            return ""
-        return f"{_show(value)}: a byte_array holds 0 to 255"
-    article = "an" if given[0] in "ai" else "a"
-    return f"{_show(value)}: it is {article} {given}, declared is {declared}"
-
-
-def suggestion(value: ParameterValue, declared: str) -> str:
-    """Return how to write the value so that it fits; empty if not known."""
-    if declared == "double" and isinstance(value, int) and not isinstance(value, bool):
-        return f"write {float(value)}"
-    if declared == "string" and not isinstance(value, (str, tuple)):
-        return "put it in quotes"
-    if declared == "double_array" and type_of(value) == "int_array" and isinstance(value, tuple):
-        return f"write [{', '.join(str(float(each)) for each in value)}]"
-    if declared.endswith("_array") and not isinstance(value, tuple):
-        return f"write [{_show(value)}]"
-    return ""
-
-
-def _show(value: ParameterValue) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(quote(each) for each in value[:4])}{', …' if len(value) > 4 else ''}]"
-    return quote(value)
+from lifecycle.manifest.parameter_values import is_implicit, misfit, suggestion
 
 
 def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import SIM_TIME, EndpointKind, ParameterValue
+from lifecycle.manifest.parameter_values import NOT_FINITE, is_implicit
 from lifecycle.plan.model import ExpectedParameter, PlannedNode, uses_sim_time
-from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
+from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN
 from lifecycle.printable import listed
 from lifecycle.verify.observation import SERVES_NONE, ObservedEndpoint, ParameterReport
 from lifecycle.verify.outcome import Outcome

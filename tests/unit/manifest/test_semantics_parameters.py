@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from lifecycle.manifest.checks.parameters import misfit, suggestion
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import ParameterValue
-from lifecycle.manifest.parameter_files import Section, read_scalar, type_of
+from lifecycle.manifest.parameter_files import Section, read_scalar
+from lifecycle.manifest.parameter_values import misfit, suggestion, type_of
 
 Findings = Callable[..., list[str]]
 

@@ -20,9 +20,9 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.parameter_files import read_parameter_file
+from lifecycle.manifest.parameter_values import portable
 from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.model import Plan
-from lifecycle.plan.parameters import portable
 from tests.builders import at, manifest, node
 
 SCHEMA = Path(__file__).parents[3] / "schemas" / "plan.v1.schema.json"
