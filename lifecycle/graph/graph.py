@@ -16,6 +16,7 @@ import typing
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
 from typing import Any, TypeVar
 
+from msgspec.structs import replace
 from rclpy.node import Node
 
 from lifecycle.errors import MiddlewareError
@@ -253,7 +254,7 @@ class Graph:
             return await self.observe(plan, only=only, machines=machines)
         for each in self._answered.values():
             self.state.learn(each)
-        return self.state.observation(
+        observation = self.state.observation(
             nodes,
             endpoints,
             answers,
@@ -261,6 +262,7 @@ class Graph:
             health=self._diagnostics.reports(),
             measured=self._measurements.measured(),
         )
+        return replace(observation, departed=self.discovery.departed)
 
     def measure_anew(self) -> None:
         """Forget what was counted of topics that this process measures."""

@@ -119,6 +119,9 @@ def lay_out(
         groups=groups,
         seen=_seen(groups, actual, tools),
         seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
+        departed=tuple(
+            replace(SeenEndpoint.of(each), has_ended=True) for each in observation.departed
+        ),
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(
             reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}

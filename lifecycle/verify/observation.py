@@ -311,6 +311,8 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
         measured: what subscriptions of the observer have counted; None where it has none.
         active_s: for how long nodes are seen to be there and active, seconds, each after its full
             name: those that do not report it themselves, or on another machine.
+        departed: publishers and subscriptions of processes that have ended, which discovery shows
+            still, and others may count as their peers still.
         clocks: of the hosts of other machines of the system, each after the machine's name; None
             where nobody compares them, or delays are not judged yet.
         marks: from other machines of the system, where flows with a DSCP come from them.
@@ -322,6 +324,7 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True):
     parameters: tuple[NodeParameters, ...] = ()
     measured: Measured | None = None
     active_s: tuple[tuple[str, float], ...] = ()
+    departed: tuple[ObservedEndpoint, ...] = ()
     clocks: tuple[tuple[str, ClockOffset], ...] | None = None
     marks: tuple[ArrivedMark, ...] = ()
 

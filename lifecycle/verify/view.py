@@ -57,6 +57,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
         is_stranger: it is none that the system has for good: whatever can match it may be matched
             with it or not.
+        has_ended: its process has; others may count it as a peer until its lease ends.
         is_shown: discovery or its node shows it; else it is known from its declaration alone.
     """
 
@@ -69,6 +70,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
     is_stranger: bool = False
+    has_ended: bool = False
     is_shown: bool = True
 
     @property
@@ -224,6 +226,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         groups: all endpoints that are judged by full node name, sorted by it.
         seen: every publisher and subscription of the graph, tools left out, sorted.
         seen_of_tools: those of tools, which others may be matched with too.
+        departed: those of processes that have ended, which others may be matched with still.
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
         measured: what subscriptions of the observer have counted; None where it has none.
@@ -254,6 +257,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     groups: dict[str, tuple[ObservedEndpoint, ...]]
     seen: tuple[SeenEndpoint, ...]
     seen_of_tools: tuple[SeenEndpoint, ...]
+    departed: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
     measured: Measured | None

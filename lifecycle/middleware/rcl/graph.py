@@ -82,6 +82,10 @@ _GET_STATE = "lifecycle_msgs/srv/GetState"
 Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 
+_COUNTED_S = 2.0
+"""Others may find that a lease has ended so much later than this observer, and say so."""
+
+
 @typing.final
 class GraphObserver:
     """What discovery shows of the graph of one domain, to a hidden node of its own.
@@ -98,6 +102,7 @@ class GraphObserver:
     Attributes:
         urls: of its connections; none where the RMW chooses.
         settling: for how long the last `snapshot` may miss a participant.
+        departed: publishers and subscriptions of ended processes that the last one left out.
         owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
@@ -137,6 +142,8 @@ class GraphObserver:
         self._guard = GraphGuard.of(node)
         self._unwatch = self._guard.follow(node, lambda: None)  # it runs while one follows
         self._name = self.node.get_fully_qualified_name()
+        self.departed: tuple[ObservedEndpoint, ...] = ()
+        self._departed_s: dict[ObservedEndpoint, float] = {}  # when each was last shown
         self._dead: frozenset[str] = frozenset()
         self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
         self._own = ""  # the observer's GUID prefix, once a process has ended
@@ -188,9 +195,7 @@ class GraphObserver:
         else:
             self._topics_before = frozenset(topics)
         homes: dict[str, Counter[str]] = {}
-        for each in endpoints_in(self.node, topics):
-            if self._is_dead(each):
-                continue
+        for each in self._living(endpoints_in(self.node, topics)):
             if each.node:
                 has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
@@ -235,6 +240,20 @@ class GraphObserver:
             folded = fold_actions(self._hashed(judged))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
+
+    def _living(self, endpoints: Iterable[ObservedEndpoint]) -> list[ObservedEndpoint]:
+        """Return the endpoints whose processes have not ended; note the topics' ends of others."""
+        living: list[ObservedEndpoint] = []
+        departed: list[ObservedEndpoint] = []
+        for each in endpoints:
+            (departed if self._is_dead(each) else living).append(each)
+        now_s = time.monotonic()
+        self._departed_s |= {each: now_s for each in departed if each.kind.is_topic}
+        self._departed_s = {
+            each: at_s for each, at_s in self._departed_s.items() if now_s - at_s < _COUNTED_S
+        }
+        self.departed = tuple(sorted(self._departed_s, key=_order))
+        return living
 
     @property
     def prefix(self) -> str:

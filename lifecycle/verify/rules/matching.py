@@ -2,7 +2,8 @@
 
 Judged pair by pair: each end that reports counts the peers that it is matched with. A count that is
 that of all endpoints of the graph that can match it, tools' included, proves the pair; a lower one
-is settled by the other end's, and one of zero is a violation. Where neither end reports, discovery
+is settled by the other end's, and one of zero is a violation. An end counts a peer whose process
+was killed until that one's lease ends. Where neither end reports, discovery
 has to do: both ends are there, of one type, and compatible, which is DDS's own condition for a
 match (DDS 1.4 §2.2.2.5, §2.2.3) but for the partition, which no layer reports upward; that is not
 enough for a declared link.
@@ -71,7 +72,7 @@ _OK: Match = (Outcome.OK, "")
 
 
 _Ends = tuple[list[SeenEndpoint], list[SeenEndpoint]]
-"""All publishers and all subscriptions of a topic, tools' included."""
+"""All publishers and all subscriptions of a topic, tools' and those that have ended included."""
 
 _NO_ENDS: _Ends = ([], [])
 
@@ -121,7 +122,7 @@ def match(
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow, every end that reports how many peers it has, every client."""
     topics: dict[str, _Ends] = {}
-    for each in (*view.seen, *view.seen_of_tools):
+    for each in (*view.seen, *view.seen_of_tools, *view.departed):
         publishers, subscriptions = topics.setdefault(each.name, ([], []))
         (publishers if each.kind is EndpointKind.PUBLISHER else subscriptions).append(each)
     for flow in view.flows:
@@ -152,10 +153,11 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
             continue
         publishers, subscriptions = topics.get(actual.name, _NO_ENDS)
         publishes = actual.kind is EndpointKind.PUBLISHER
-        possible = len(_possible(actual, subscriptions if publishes else publishers))
+        known = _possible(actual, subscriptions if publishes else publishers)
+        possible = sum(not each.has_ended for each in known)
         other = actual.kind.other_end
         place = (other, actual.name)
-        if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
+        if place in NOISE_TOPICS or report.matched <= len(known) + unseen[place]:
             continue
         yield UNKNOWN_PEER.on(
             actual,
@@ -256,10 +258,11 @@ def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | No
     report = end.report
     if report is None or report.matched is None:
         return None
-    matched, possible = report.matched, _possible(end, others)
+    matched, known = report.matched, _possible(end, others)
+    possible = [each for each in known if not each.has_ended]
     word = f"the {end.kind.noun}"
     reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched none"
-    if matched == len(possible):
+    if matched in (len(possible), len(known)):
         return _OK
     if matched < len(possible) and (matched == 0 or not any(each.is_stranger for each in possible)):
         return Outcome.VIOLATED, reason

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 from rclpy.node import Node
+from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.process.shared_memory import leftovers, sweep
@@ -201,3 +203,40 @@ def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
         restarts_at_once(run, tmp_path)
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
+
+
+HEARER = (
+    "import rclpy, std_msgs.msg; rclpy.init(); node = rclpy.create_node('listener'); "
+    "node.create_subscription(std_msgs.msg.String, 'chatter', lambda _: None, 10); rclpy.spin(node)"
+)
+"""It reports nothing, so that the publisher's count alone proves the pair."""
+
+SETTLED_S = 1.0
+LEASE_S = 12.0
+"""By then a participant of Fast DDS that was killed is forgotten by all."""
+
+
+def test_a_killed_peer_that_others_count_still_casts_no_doubt_on_the_one_that_replaced_it(
+    tmp_path: Path, fresh_domain: int, bystander: Node
+) -> None:
+    edit = {
+        "policy/undeclared_nodes": "open",
+        "nodes/listener/run": {"command": [sys.executable, "-c", HEARER]},
+        "nodes/listener/managed": False,
+        "nodes/listener/restart": "always",
+        "nodes/listener/restart_sec": 0.5,
+    }
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        killed_s = kill(run, "listener")
+        since = run.catch_up()
+        run.met("system", since=since, reached="active")
+        time.sleep(SETTLED_S)
+        run.catch_up()
+        back = len(run.of_kind("verdict"))
+        while time.monotonic() < killed_s + LEASE_S:  # each change is looked at
+            bystander.destroy_publisher(bystander.create_publisher(String, "elsewhere", 1))
+            time.sleep(0.3)
+        run.catch_up()
+        said = [each["verdict"]["verdict"] for each in run.of_kind("verdict")[back - 1 :]]
+        assert set(said) == {"ok"}

@@ -54,6 +54,7 @@ class FakeGraph:
         self.foreign: set[str] = set()
         self.elsewhere: set[str] = set()
         self.settling = self
+        self.departed: tuple[ObservedEndpoint, ...] = ()
 
     def snapshot(
         self, *, names: DeclaredNames = NO_NAMES

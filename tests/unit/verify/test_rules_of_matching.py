@@ -247,6 +247,33 @@ def test_a_count_proves_a_pair_only_if_it_is_that_of_all_who_can_match(plan, edi
 
 
 @pytest.mark.parametrize(
+    ("kind", "matched", "expected"),
+    [
+        (PUB, 1, []),
+        (PUB, 2, []),
+        (SUB, 2, []),
+        (PUB, 0, [("violated", "the publisher matched none")]),
+        (
+            PUB,
+            3,
+            [("unverifiable", "the publisher matched 3 of 1, and does not tell which")],
+        ),
+    ],
+)
+def test_a_peer_whose_process_was_killed_may_be_counted_still(kind, matched, expected):
+    def edit(seen: Observation) -> Observation:
+        ended = SUB if kind is PUB else PUB
+        (gone,) = (each for each in seen.endpoints if each.kind is ended)
+        departed = (replace(gone, gid="77", node=""),)
+        return replace(counts(kind, matched)(seen), departed=departed)
+
+    assert said(edit, pair()) == expected
+    closed = planned(node("one", publisher("a")), node("two", subscription("a")))
+    verdict = verify(closed, edit(perfect(closed)), stage=Stage.CONNECTED)
+    assert ("graph.unknown-peer" in {each.rule for each in verdict.findings}) == (matched == 3)
+
+
+@pytest.mark.parametrize(
     ("kind", "qos", "other"),
     [
         (PUB, BEST, {"qos": RELIABLE}),
