@@ -8,7 +8,7 @@ verified.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 from msgspec.structs import replace
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -91,6 +91,24 @@ def endpoints_in(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint
             yield from _read(node, kind, shown, topic)
 
 
+def nameless_repliers(
+    node: Node, topics: Iterable[str], wanted: Callable[[EndpointKind, str], bool]
+) -> Iterator[ObservedEndpoint]:
+    """Yield what is at replies of wanted services and belongs to no node, or to none yet.
+
+    Whoever writes replies may answer requests that it does not even read.
+    """
+    for topic in topics:
+        if not (OVER_DDS and topic.startswith("rr/") and topic.endswith("Reply")):
+            continue
+        name = topic.removeprefix("rr").removesuffix("Reply")
+        for kind in OF_SERVICES:
+            if wanted(kind, name):
+                writes = kind is EndpointKind.SERVICE_SERVER
+                found = _read(node, kind, name, topic, writes=writes)
+                yield from (each for each in found if not each.node)
+
+
 def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str], str]:
     """Return the topics that the RMW has, and one name that is no UTF-8, escaped; else empty.
 
@@ -107,8 +125,9 @@ def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str]
 
 
 def rmw_topics(topics: Iterable[str], services: Iterable[str]) -> set[str]:
-    """Return what the RMW calls topics of ROS, and the requests of services."""
-    return {*map(_TOPIC.format, topics), *map(_REQUEST.format, services)}
+    """Return what the RMW calls topics of ROS, and the requests and replies of services."""
+    names = tuple(services)
+    return {*map(_TOPIC.format, topics), *map(_REQUEST.format, names), *map(_REPLY.format, names)}
 
 
 def services_of_node(node: Node, full_name: str) -> list[ObservedEndpoint]:
