@@ -34,6 +34,7 @@ from lifecycle.cli.standard_streams import Watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
+from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
@@ -330,25 +331,34 @@ def _apply(
     if changed and dry_run:
         return ExitCode.VIOLATED
     if changed and plan.bounds:
-        seen = _measured_again(seen, plan)
-    return exit_code(seen.verdict, strict=False)
+        seen = _measured_again(seen)
+    if code := exit_code(seen.verdict, strict=False):
+        found = f"{seen.verdict.verdict.value}; {not_ok(seen.verdict)}"
+        click.echo(lines(f"the system is {found}"), err=True)
+    return code
 
 
-def _measured_again(seen: JudgedSystem, plan: Plan) -> JudgedSystem:
+def _measured_again(seen: JudgedSystem) -> JudgedSystem:
     """Say what was measured before networks were changed, and after; return what is so after."""
     before = [each for each in seen.verdict.measured if each.bounds]
     if not before:
-        machine = {each.full_name: each.machine for each in plan.nodes}
+        machine = {each.full_name: each.machine for each in seen.plan.nodes}
         there = sorted({machine[each.subscription] for each in seen.verdict.flows} - {""})
         on = f" on {' and '.join(there)}" if there else ""
         click.echo(
-            lines(f"what arrives is measured{on}: see `lifecycle status {plan.system}` there"),
+            lines(f"what arrives is measured{on}: see `lifecycle status {seen.plan.system}` there"),
             err=True,
         )
         return seen
     click.echo(f"measuring for {_FRESH_S:g} s what has changed", err=True)
+    from lifecycle.supervisor.run.looking import with_supervisors_numbers
+
     time.sleep(_FRESH_S)
-    seen = _judged(plan, _SETTLED_S)
+    for _ in range(_SETTLED_S):
+        seen = with_supervisors_numbers(seen)
+        if not any(each.violated for each in seen.verdict.measured):
+            break
+        time.sleep(1.0)
     click.echo(before_and_after(before, seen.verdict.measured))
     return seen
 
@@ -356,8 +366,8 @@ def _measured_again(seen: JudgedSystem, plan: Plan) -> JudgedSystem:
 _FRESH_S = 6.0
 """Then delays are of messages that came after a change: of the last 5 s, reported within 1 s."""
 
-_SETTLED_S = 4.0
-"""Numbers that are not kept then may still be of a queue that was full before the change."""
+_SETTLED_S = 4
+"""Seconds more for numbers that are not kept: they may be of a queue that was full before."""
 
 
 def _judged(plan: Plan, timeout_s: float) -> JudgedSystem:
