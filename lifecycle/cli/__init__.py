@@ -91,7 +91,6 @@ VERBS = {
         "judge a running system, started by anyone; for CI",
         "verify robot.lifecycle.yaml --format junit",
         ROS,
-        "check:verify",
     ),
     "flows": Verb("show every network flow and how unique it is", "flows robot --export nft", ROS),
     "graph": Verb(
@@ -107,7 +106,7 @@ VERBS = {
         "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
         "import robot.launch.py > robot.lifecycle.yaml",
         "",
-        "capture:import",
+        "import_",
     ),
     "capture": Verb(
         "write a manifest from a running system, gaps marked",
@@ -123,7 +122,6 @@ VERBS = {
         "show what happened in a run, from its journal",
         "history --system robot",
         LINUX,
-        "logs:history",
     ),
     "run": Verb(
         "run one node of a manifest in this terminal, without a supervisor",
@@ -134,7 +132,6 @@ VERBS = {
         "DDS port arithmetic and platform limits",
         "ports --domain 7 --participant 3",
         "",
-        "plan:ports",
     ),
     "init": Verb(
         "make a package of one's own: nodes, manifest, tests, CI workflow", "init my_robot"

@@ -1,6 +1,6 @@
-"""`lifecycle check` and `lifecycle verify`: judge a manifest, and what runs, started by anyone.
+"""`lifecycle check`: judge a manifest without running anything; imports nothing of ROS.
 
-`check` imports nothing of ROS. Owns: the verbs, `CheckReport` and its formats: text, JSON, SARIF
+Owns: the verb, `CheckReport` and its formats: text, JSON, SARIF
 2.1.0 and JUnit. The tests of a JUnit report are the same four whatever was found, so that a CI's
 history can follow them; none is ever skipped.
 """
@@ -8,7 +8,6 @@ history can follow them; none is ever skipped.
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import click
@@ -18,18 +17,13 @@ from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
 from lifecycle.cli.common import (
     format_option,
     json_of,
-    load_plan,
     machine_option,
     manifest_arguments,
     parse_assignments,
     resolve,
     run_commands_option,
-    timeout_option,
 )
 from lifecycle.cli.report import (
-    ReportFile,
-    exit_code,
-    format_verdict,
     report_format,
     report_option,
     write_report,
@@ -310,50 +304,3 @@ def check(
         diagnostics=diagnostics,
         unresolved=resolution.unresolved,
     )
-
-
-@click.command("verify")
-@manifest_arguments
-@format_option("text", "json", "junit", "sarif", "github")
-@timeout_option(5.0, "How long a graph that is not ok may still become so.")
-@click.option("--strict", is_flag=True, help="Exit 5 if anything could not be verified.")
-@report_option
-def verify_command(  # noqa: PLR0917 - click passes options by name
-    manifest: str,
-    assignments: tuple[str, ...],
-    format_: str,
-    timeout: float,
-    strict: bool,
-    report: Path | None,
-) -> int:
-    """Attach to whatever runs and judge it against the manifest, as an active system.
-
-    Exits with 0 if it is what was declared, 4 if it is not, and 5 under --strict, or where the
-    manifest says that it blocks, if something could not be verified.
-    """
-    from lifecycle.supervisor.run.signals import Ended, Ending
-
-    try:
-        with (
-            Ending() as ending,
-            ReportFile(report, strict=strict) as written,
-            ending.unmasked(),
-        ):
-            from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
-
-            plan = load_plan(manifest, assignments)
-            written.begin(plan)
-            seen = judge_running(plan, timeout_s=timeout, strict=strict)
-            seen = with_supervisors_numbers(seen)
-            with ending.noted():
-                unwritten = written.end(seen.verdict)
-    except Ended as ended:
-        click.echo(f"ended before it was judged: {ended.reason}", err=True)
-        return ended.exit_code
-    # From here on a signal ends what waits for a reader.
-    for each in seen.notices:
-        click.echo(lines(each), err=True)
-    colour = format_ == "text" and sys.stdout.isatty()
-    text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
-    click.echo(text.rstrip("\n"))
-    return exit_code(seen.verdict, strict=strict) or unwritten

@@ -322,8 +322,11 @@ def _apply(
     options, treatment = read_networks(targets, rest, option="--target")
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
+    from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
+
     plan = load_plan(manifest, assignments)
-    seen = _judged(plan, timeout)
+    seen = judge_running(plan, timeout_s=timeout, strict=False)
+    seen = with_supervisors_numbers(seen)
     for each in seen.notices:
         click.echo(lines(each), err=True)
     flows = seen.verdict.flows
@@ -370,23 +373,14 @@ _SETTLED_S = 4
 """Seconds more for numbers that are not kept: they may be of a queue that was full before."""
 
 
-def _judged(plan: Plan, timeout_s: float) -> JudgedSystem:
-    from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
-
-    return with_supervisors_numbers(judge_running(plan, timeout_s=timeout_s, strict=False))
-
-
 def before_and_after(before: Iterable[FlowMeasurement], after: Iterable[FlowMeasurement]) -> str:
-    """Return what was measured of each flow with declared numbers, in a line for each time."""
+    """Return what was measured of each flow before and after, a line for each."""
     now = {each.pair: each for each in after}
     said = []
     for each in before:
-        if each.bounds:
-            then = now.get(each.pair)
-            said.append(f"before: {each.describe()}")
-            said.append(
-                f"after:  {f'{each.name}: not measured' if then is None else then.describe()}"
-            )
+        then = now.get(each.pair)
+        said.append(f"before: {each.describe()}")
+        said.append(f"after:  {f'{each.name}: not measured' if then is None else then.describe()}")
     return lines("\n".join(said))
 
 

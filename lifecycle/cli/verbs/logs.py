@@ -1,27 +1,21 @@
-"""`lifecycle logs` and `lifecycle history`: what a run left on disk, its logs and its journal."""
+"""`lifecycle logs`: what the processes of a run wrote."""
 
 from __future__ import annotations
 
 import collections
 import contextlib
-import datetime as dt
 import os
 import re
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import click
 
-from lifecycle.cli.common import completing, format_option
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text, lines, log_line, one_line
-
-if TYPE_CHECKING:
-    from lifecycle.supervisor.run.journal import RecordedRun
-    from lifecycle.verify.verdict import Finding, Verdict
+from lifecycle.printable import log_line
 
 _LOOK_S = 0.2
 """So often is looked for new lines and files."""
@@ -146,101 +140,3 @@ def _is_another(file: BinaryIO, path: Path) -> bool:
         return not os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:
         return False
-
-
-def _recorded(run: str | None, system: str) -> RecordedRun:
-    """Read the journal that is meant; what of it cannot be read is said on stderr.
-
-    Raises:
-        UsageError: there is none.
-    """
-    from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
-    from lifecycle.supervisor.run.journal import journal_files, read_run
-
-    if run is None:
-        root = ros_log_root(os.environ)
-        there = [each for each in runs_of(root, system) if any(each.glob("journal.jsonl"))]
-        if not there:
-            of = f" of {system!r}" if system else ""
-            raise UsageError(
-                f"cannot find a run{of} with a journal in {str(root)!r}",
-                hint="journals are beside the logs of a run, where ROS_LOG_DIR says",
-            )
-        path = there[0]
-    else:
-        path = Path(run)
-        if not os.path.exists(path) and os.path.exists(ros_log_root(os.environ) / run):
-            path = ros_log_root(os.environ) / run
-    recorded = read_run(journal_files(path))
-    for place, why in recorded.unreadable:
-        click.echo(lines(f"passed over {place}: {why}"), err=True)
-    if recorded.run is None:
-        raise UsageError(f"cannot read {str(path)!r} as a journal: no line says of which run")
-    return recorded
-
-
-_SET_S = 0.5
-"""A clock that is ahead by so much more, or less, than at the line before was set meanwhile."""
-
-
-def _clock(at: float) -> str:
-    return dt.datetime.fromtimestamp(at).astimezone().strftime("%H:%M:%S.%f")[:-3]
-
-
-@click.command("history")
-@click.argument("run", required=False, metavar="[RUN]", shell_complete=completing("runs"))
-@click.option("--system", default="", metavar="NAME", help="The latest run of this system.")
-@format_option("text", "json")
-def history_command(*, run: str | None, system: str, format_: str) -> int:
-    """Show what happened in a run, oldest first; of RUN, or of the run that began last.
-
-    RUN is the log directory of a run, or the journal in it. Below each verdict are the findings
-    that it has and the one before had not (+), and those that are gone (-). JSON has the lines of
-    the journal.
-    """
-    recorded = _recorded(run, system)
-    if format_ == "json":
-        for moment in recorded.moments:
-            echo_while_read(json_text(moment.text))
-        return ExitCode.OK
-    for each in _timeline(recorded):
-        echo_while_read(each)
-    return ExitCode.OK
-
-
-def _timeline(recorded: RecordedRun) -> Iterator[str]:
-    from lifecycle.cli.up_output import Narrator
-    from lifecycle.supervisor.run.events import Stopped, VerdictChanged
-
-    over, narrator = False, Narrator()
-    found: tuple[Finding, ...] = ()
-    ahead_s: float | None = None
-    for each in recorded.moments:
-        over = isinstance(each.event, Stopped) or (over and each.line.run is None)
-        at = f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}"
-        # The host's clock is ahead of the one that only goes forward: by as much, until it is set.
-        before_s, ahead_s = ahead_s, each.line.at - each.line.elapsed_s
-        set_s = 0.0 if before_s is None else ahead_s - before_s
-        if abs(set_s) >= _SET_S:
-            way = "forward" if set_s > 0 else "back"
-            yield f"{at}  the clock of this host was set {way} by {abs(set_s):.1f} s"
-        if each.event and (text := narrator.line(each.event)):
-            yield f"{at}  {text}"
-        if isinstance(each.event, VerdictChanged):
-            yield from _changes(found, each.event.verdict)
-            found = each.event.verdict.findings
-    if not over and recorded.moments:
-        pid = recorded.run.supervisor if recorded.run else 0
-        if not Path(f"/proc/{pid}").exists():
-            yield f"the journal ends here: supervisor {pid} ended without saying so"
-
-
-def _changes(before: tuple[Finding, ...], verdict: Verdict) -> Iterator[str]:
-    """Say which findings came and which are gone."""
-    known = {(each.rule, each.subject, each.outcome) for each in before}
-    now = {(each.rule, each.subject, each.outcome) for each in verdict.findings}
-    for each in verdict.findings:
-        if (each.rule, each.subject, each.outcome) not in known:
-            yield one_line(f"    + {each.outcome.value} {each.rule}: {each.message}")
-    for rule, subject, outcome in sorted(known - now):
-        yield one_line(f"    - {outcome.value} {rule}: {subject}")

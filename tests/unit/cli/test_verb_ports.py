@@ -15,7 +15,7 @@ from lifecycle.network.ports import LINUX
 @pytest.fixture(autouse=True)
 def linux(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ephemeral ports as Linux has them by default."""
-    monkeypatch.setattr("lifecycle.cli.verbs.plan.read_ephemeral_range", lambda _: LINUX)
+    monkeypatch.setattr("lifecycle.cli.verbs.ports.read_ephemeral_range", lambda _: LINUX)
 
 
 def test_the_four_ports_the_safe_domains_and_what_fits_are_printed(

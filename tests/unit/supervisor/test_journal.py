@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
 
-from lifecycle.cli.verbs.logs import history_command
+from lifecycle.cli.verbs.history import command as history_command
 from lifecycle.errors import UsageError
 from lifecycle.supervisor.run.events import Notice, Stopped, VerdictChanged
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
