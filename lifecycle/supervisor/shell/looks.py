@@ -9,7 +9,7 @@ verdict means is the core's. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition, EndpointKind
 from lifecycle.measure.sample import SLOT_S
-from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, gate, messages
@@ -104,7 +103,6 @@ class Looks:
         self.seen = Observation()
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
-        self._left: dict[str, float] = {}  # topics of processes that ended, and until when
         self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
         # Nodes that are not our hosts' and their participants' prefixes, and since when.
         self._active: dict[tuple[str, str], float] = {}
@@ -114,11 +112,6 @@ class Looks:
     def is_behind(self) -> bool:
         """Whether this process stood still since the last look began."""
         return self._stills != self._standstill.count()
-
-    def left(self, topics: Iterable[str]) -> None:
-        """Note that a process with endpoints of these topics has ended."""
-        until_s = asyncio.get_running_loop().time() + FORGOTTEN_S
-        self._left.update(dict.fromkeys(topics, until_s))
 
     def close(self) -> None:
         """Judge no more."""
@@ -299,19 +292,15 @@ class Looks:
         return self._asked_of[2]
 
     def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
-        """Return a verdict without peers that the graph cannot explain yet, or any longer.
+        """Return a verdict without peers that the graph cannot explain yet.
 
-        Over TCP an end counts a peer that was killed until its lease runs out, and nothing can
-        take it away before. Behind the gate a newcomer has DISCOVERED_S to be discovered.
+        Behind the gate a newcomer has DISCOVERED_S to be discovered.
         """
         now_s = asyncio.get_running_loop().time()
-        self._left = {topic: at for topic, at in self._left.items() if at > now_s}
         found = {each.key: each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
         self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
-        until_s = {}
-        for key, since_s in self._unknown_peers.items():
-            least_s = since_s + DISCOVERED_S if stage is Stage.ACTIVE else now_s
-            until_s[key] = max(least_s, self._left.get(found[key].subject, now_s))
+        may_pass_s = DISCOVERED_S if stage is Stage.ACTIVE else 0.0
+        until_s = {key: since_s + may_pass_s for key, since_s in self._unknown_peers.items()}
         passing = {key: at for key, at in until_s.items() if at > now_s}
         self._passing_s = min(passing.values(), default=NEVER_S) - now_s
         if not passing:

@@ -155,7 +155,6 @@ class Processes:
         end = process.ended.result()
         carried = system.carried_by(process.name)
         self.forget(process.pid, carried)
-        self._shell.looks.left(each.resolved for node in carried for each in node.planned.endpoints)
         self._shell.give(
             messages.Exited(
                 process=process.name,
