@@ -202,11 +202,11 @@ _FEW = 5
 """So many keys are listed also where a better place for an unknown one is named."""
 
 _NAME = "NAME"
-"""What stands in a place for a name that users choose, and for a number in a list."""
+"""In a place, any name that users choose, or any number in a list."""
 
 
 def _elsewhere(place: Place) -> str:
-    """Return where a manifest has a key that is unknown where it stands; empty if nowhere."""
+    """Return which other mapping of a manifest has the last key of `place`; empty if none."""
 
     def likeness(known: tuple[str, ...]) -> tuple[int, int, int]:
         pairs = itertools.takewhile(

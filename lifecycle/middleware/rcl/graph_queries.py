@@ -94,7 +94,7 @@ def endpoints_in(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint
 def nameless_repliers(
     node: Node, topics: Iterable[str], wanted: Callable[[EndpointKind, str], bool]
 ) -> Iterator[ObservedEndpoint]:
-    """Yield what is at replies of wanted services and belongs to no node, or to none yet.
+    """Yield the endpoints at reply topics of wanted services that belong to no node, or none yet.
 
     Whoever writes replies may answer requests that it does not even read.
     """
