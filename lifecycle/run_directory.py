@@ -448,6 +448,17 @@ def lost(path: Path) -> UsageError:
     )
 
 
+def silent(path: Path) -> UsageError:
+    """Return the error that a supervisor runs, and does not answer within a few seconds."""
+    record = read_record(path)
+    pid = record.supervisor.pid if record is not None else "PID"
+    return UsageError(
+        f"cannot ask {path.name!r}: its supervisor (pid {pid}) does not answer",
+        hint=f"let it go on if it was stopped: kill -CONT {pid}; "
+        f"or end all of it: kill -9 {pid}; lifecycle down {path.name}",
+    )
+
+
 def left_behind(*roots: Path) -> tuple[Path, ...]:
     """Return the directories of all runs whose supervisor was killed, sorted by name."""
     return tuple(each for each in _all(roots) if not is_held(each) and read_record(each))

@@ -312,7 +312,9 @@ def asking(path: Path) -> Iterator[None]:
     try:
         yield
     except TimeoutError as error:
-        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
+        from lifecycle.run_directory import silent
+
+        raise silent(path) from error
     except (FileNotFoundError, ConnectionRefusedError) as error:
         from lifecycle.run_directory import lost
 

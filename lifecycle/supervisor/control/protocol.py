@@ -29,6 +29,7 @@ from lifecycle.run_directory import (
     lost,
     new_run_id,
     read_record,
+    silent,
     start_ticks,
 )
 from lifecycle.verify.outcome import ConnectionReport, Outcome
@@ -376,9 +377,10 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         Its exit code and, where it is not OK, why.
 
     Raises:
-        UsageError: it runs no more.
+        UsageError: it runs no more, or does not answer; it was ordered nothing then.
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
+    _rouse(path)
     answer = _answered(path, question, timeout_s, Answer)
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
@@ -401,6 +403,14 @@ def _asked(path: Path, question: Question, timeout_s: float, type_: type[A]) -> 
         return None
 
 
+def _rouse(path: Path) -> None:
+    """Raise UsageError where a supervisor listens and does not answer: it was stopped, say."""
+    try:
+        _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
+    except TimeoutError as error:
+        raise silent(path) from error
+
+
 def down(path: Path, timeout_s: float) -> ExitCode:
     """End a system, and clean up where its supervisor cannot any more.
 
@@ -409,9 +419,10 @@ def down(path: Path, timeout_s: float) -> ExitCode:
 
     Raises:
         TimeoutError: it still runs after `timeout_s`.
-        UsageError: what answers is no supervisor of this version.
+        UsageError: it does not answer, or is no supervisor of this version.
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
+    _rouse(path)
     deadline = time.monotonic() + timeout_s
     patience = time.monotonic() + _STARTS_S
     question, left_s = Question(ask=ControlRequest.DOWN), timeout_s

@@ -424,6 +424,8 @@ def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
 def end_done(run: Run) -> list[Event]:
     """End a run that was held for as long as was asked."""
     code, why = _outcome(run, run.judged.counted)
+    if code is ExitCode.OK and run.decided_s is None:
+        code, why = ExitCode.UNVERIFIABLE, "its data were not measured"
     reason = f"done, but {why}" if why else "done"
     return end(run, Ending(code=code, stopping="done", reason=reason))
 

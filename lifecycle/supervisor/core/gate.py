@@ -238,19 +238,24 @@ def has_probation(run: Run) -> bool:
     return run.options.until is Until.ACTIVE and bool(run.plan.bounds)
 
 
+def is_unsettled(run: Run) -> bool:
+    """Return whether data cannot be measured now: it is paused, or some of it is on its way."""
+    away = any(each.away_s is not None for each in run.processes.values())
+    return bool(away or run.paused or run.passage or run.order or run.change or run.switch)
+
+
 def is_measuring(run: Run) -> bool:
     """Return whether a declared number of a system that is held is decided before long.
 
-    That is its probation: PROBATION_S from when it was brought up, at most. Nothing is decided
-    while it is paused or some of it is on its way.
+    That is its probation: PROBATION_S from when it was brought up or resumed, at most. Nothing is
+    decided while it is not settled.
     """
     if run.held_s is None or run.decided_s is not None or not has_probation(run):
         return False
-    until_s = run.held_s + PROBATION_S
+    until_s = run.measures_s + PROBATION_S
     if run.is_past(until_s):
         return False
-    away = any(each.away_s is not None for each in run.processes.values())
-    if away or run.paused or run.passage or run.order or run.change or run.switch:
+    if is_unsettled(run):
         return True
     verdict, judged = run.judged.verdict, run.judged
     left_s = until_s - run.now_s

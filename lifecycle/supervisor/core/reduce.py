@@ -43,6 +43,7 @@ from lifecycle.supervisor.core.state import (
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
 from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
+from lifecycle.verify.rules.measured import PROBATION_S
 
 _UPWARDS = (*UP.values(), Step.WIRE)
 _PASSES = 3
@@ -82,10 +83,13 @@ def _settle(run: Run) -> list[Event]:
         events += orders.settle_orders(run)
         events += orders.settle_consequences(run)
         events += failure.say_slow(run)
-        events += _hold(run)
     if passage is not None and run.passage is None and was_held:
         run.changed()  # a look that began on the way through the gate measures nothing
         run.probation = run.mark
+        if run.decided_s is None:
+            run.measures_s = run.now_s
+    if run.ending is None:
+        events += _hold(run)
     return [*events, *_returned(run)]
 
 
@@ -420,7 +424,7 @@ def _hold(run: Run) -> list[Event]:
     """Hold the system once it is up, and end the run once it was held for as long as asked."""
     if run.held_s is None:
         if run.passage is None and not run.failures and run.furthest:
-            run.held_s = run.now_s
+            run.held_s = run.measures_s = run.now_s
             if not gate.has_probation(run):
                 run.decided_s = run.held_s
             else:
@@ -428,12 +432,17 @@ def _hold(run: Run) -> list[Event]:
                 run.probation = run.mark
         return []
     said: list[Event] = []
-    if run.decided_s is None:
+    since_s = run.decided_s
+    if since_s is None:
         if gate.is_measuring(run):
             return []
-        run.decided_s, said = run.now_s, _measured(run)
+        if gate.is_unsettled(run):  # its data are measured once it is whole again
+            since_s = run.measures_s + PROBATION_S
+        else:
+            since_s = run.decided_s = run.now_s
+            said = _measured(run)
     hold_s = run.options.hold_s
-    over_s = NEVER_S if hold_s is None else run.decided_s + hold_s
+    over_s = NEVER_S if hold_s is None else since_s + hold_s
     if not run.is_past(over_s) or run.order is not None or run.failures:
         return said
     waits = not gate.is_latest(run) and any(

@@ -494,6 +494,7 @@ class Run(msgspec.Struct, kw_only=True):
         held_s: since when it is held; None before it was up.
         decided_s: since when what is declared of its data is decided, as far as it can be before
             long; None before.
+        measures_s: since when its data are measured, anew after each pause until they are decided.
         probation: the mark from which on looks measure.
         pauses: it is to be said that it is paused, once nothing is active.
         failures: that end the run, as soon as what is in a step has failed, too, or not.
@@ -529,6 +530,7 @@ class Run(msgspec.Struct, kw_only=True):
     furthest: str = ""
     held_s: float | None = None
     decided_s: float | None = None
+    measures_s: float = 0.0
     probation: int = 0
     paused: bool = False
     pauses: bool = False

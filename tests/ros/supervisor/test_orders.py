@@ -560,3 +560,22 @@ def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
         mood.touch()
         assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
         run.until("system", reached="active")
+
+
+def test_a_supervisor_that_stands_still_is_named_and_ordered_nothing(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        run.signal(signal.SIGSTOP)
+        try:
+            for order in ("down", "pause"):
+                done = verb(order, "pair", runtime=tmp_path)
+                assert done.returncode == ExitCode.USAGE
+                pid = run.process.pid
+                assert f"its supervisor (pid {pid}) does not answer" in done.stderr
+                assert f"kill -CONT {pid}" in done.stderr
+        finally:
+            run.signal(signal.SIGCONT)
+        assert phases(tmp_path)[0] == "active"
+        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK

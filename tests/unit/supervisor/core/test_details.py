@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
+import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
@@ -55,6 +57,44 @@ def test_what_was_measured_is_said_once_when_it_is_decided() -> None:
     assert [each.message for each in play.heard(Notice)] == [f"measured: {decides.describe()}"]
     (said,) = play.heard(VerdictChanged)
     assert said.verdict.measured == (decides, silent)
+
+
+@pytest.mark.parametrize("paused_s", [1.0, 11.0])
+def test_data_are_measured_anew_after_a_pause_however_long_it_was(paused_s: float) -> None:
+    play = measuring_play(stop_after_s=2.0)
+    play.order(ControlRequest.PAUSE)
+    play.wait(paused_s)
+    play.order(ControlRequest.RESUME)
+    play.wait(9.0)
+    assert play.phase == "measuring"
+    play.wait(2.5)
+    assert play.phase == "active"
+    play.wait(2.0)
+    assert play.code == 0
+
+
+def test_a_run_that_ends_paused_before_its_data_were_measured_is_no_success() -> None:
+    play = measuring_play(stop_after_s=2.0)
+    play.order(ControlRequest.PAUSE)
+    play.wait(11.0)
+    assert play.phase == "paused"
+    play.wait(2.0)
+    assert (play.code, play.reason) == (5, "done, but its data were not measured")
+
+
+def measuring_play(**options: Any) -> Play:
+    """A system that is up, and whose one declared number needs longer than it has."""
+    rate = (Quantity(name="rate_hz", value=9, at=HERE),)
+    image = planned_endpoint(EndpointKind.PUBLISHER, "image", quantities=rate)
+    camera = replace(planned_node("camera"), endpoints=(image,))
+    play = Play(plan_of(camera), ways={"look": "hang"}, **options)
+    decided = measured("ok", random.Random(1))
+    undecided = replace(decided.bounds[0], outcome="measuring", decides_in_s=0.5)
+    play.found = replace(play.found, measured=(replace(decided, bounds=(undecided,)),))
+    play.ways.clear()
+    play.finish("look")
+    assert play.phase == "measuring"
+    return play
 
 
 def test_a_gate_is_judged_by_a_look_that_began_when_all_were_at_it() -> None:

@@ -581,7 +581,7 @@ class World:
                 f"withheld: {node.key} stays active {self}"
             )
         probation = self.core.advance.phase_of(self.run) == "measuring"
-        assert not probation or self.now_s <= self.run.held_s + 10, "ends: measures for ever"
+        assert not probation or self.now_s <= self.run.measures_s + 10, "ends: measures for ever"
         assert not self.run.orders, "answers: an order waits for ever"
         assert self.run.order is None, f"answers: an order is never done {self}"
 
