@@ -27,6 +27,7 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.prefixes import vouch_for
@@ -246,7 +247,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         gid=info.gid if info is not None else "",
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
-        nfes=_nfes(witness, endpoint.kind, entity, connection),
+        nfes=_nfes(witness, endpoint.kind, entity),
         dscp=connection.read_dscp(),
     )
 
@@ -288,16 +289,14 @@ def _prefix_of(connection: Connection) -> str:
     return found.pop() if len(found) == 1 else ""
 
 
-def _nfes(
-    witness: Node, kind: EndpointKind, entity: Any, connection: Connection
-) -> tuple[NetworkFlowEndpoint, ...] | None:
+def _nfes(witness: Node, kind: EndpointKind, entity: Any) -> tuple[NetworkFlowEndpoint, ...] | None:
     """Return all NFEs of an endpoint; rmw_fastrtps lists shared memory of subscriptions only."""
     publishes = kind is EndpointKind.PUBLISHER
     try:
         nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
     except MiddlewareError:
         return None  # "unknown to the RMW" is a value here, and the verifier's to judge
-    if publishes and connection.has_shared_memory:
+    if publishes and has_shared_memory(witness):
         return (*nfes, SHARED_MEMORY)
     return nfes
 

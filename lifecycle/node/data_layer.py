@@ -467,11 +467,18 @@ class DataLayer:
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets."""
         publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
-        if connection.participant is None or endpoint.kind is not publisher:
+        if endpoint.kind is not publisher:
             return
-        others = [each for each in self.endpoints.values() if each.connection is connection]
-        for other in others:
-            if other is endpoint or other.kind is not publisher:
+        if connection.participant is None:
+            if endpoint.planned.unique is strict:
+                raise ConnectError(
+                    f"publisher {endpoint.name!r} must have a network flow for itself "
+                    "(strictly_required), and those of the node's own participant share one",
+                    hint="give it a connection of its own",
+                )
+            return
+        for other in self.endpoints.values():
+            if other is endpoint or (other.kind, other.connection) != (publisher, connection):
                 continue
             for one, two in ((endpoint, other), (other, endpoint)):
                 if one.planned.unique is strict:

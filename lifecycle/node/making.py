@@ -19,7 +19,7 @@ from rclpy.qos import qos_profile_system_default
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
+from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.callbacks import called
@@ -86,7 +86,7 @@ def expand(managed: Managed, endpoint: Endpoint, name: str) -> str:
 
 
 def _topic_end(managed: Managed, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-    qos, options = endpoint.planned.qos or QosProfile(), endpoint.options
+    qos, options = to_rclpy(endpoint.planned.qos or QosProfile()), endpoint.options
     create = factory(endpoint.planned, connection, managed.node)
     if endpoint.kind is EndpointKind.PUBLISHER:
         return create(endpoint.interface, name, qos, **options)
@@ -170,12 +170,12 @@ def factory(planned: PlannedEndpoint, connection: Connection, node: Node) -> Cal
     """Return what makes a publisher or subscription with a planned flow on a connection."""
     where = connection.participant
     if planned.kind is EndpointKind.PUBLISHER:
-        if where is not None:
-            return where.create_publisher  # where it is alone, it is unique
-        return functools.partial(create_publisher, node, unique=planned.unique)
-    if where is not None:
-        return functools.partial(where.create_subscription, unique=planned.unique)
-    return functools.partial(create_subscription, node, unique=planned.unique)
+        if where is None:
+            return functools.partial(Node.create_publisher, node)
+        return where.create_publisher  # where it is alone, it is unique
+    if where is None:
+        return functools.partial(create_subscription, node, unique=planned.unique)
+    return functools.partial(where.create_subscription, unique=planned.unique)
 
 
 def resolve_name(node: Node, kind: EndpointKind, name: str) -> str:

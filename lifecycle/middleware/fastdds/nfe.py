@@ -154,7 +154,7 @@ def create_subscription(
     if unique is UniqueRequirement.STRICTLY_REQUIRED and abi.refusal():
         hint = f"ask for optionally_required, or {INSTALL}"
         resolved = node.resolve_topic_name(topic)
-        raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
+        raise _not_feasible(resolved, unique, abi.refusal(), hint)
     if unique is UniqueRequirement.NOT_REQUIRED or abi.refusal():
         # Not by its class, which may do more with what its own code makes.
         return Node.create_subscription(node, type_, topic, callback, profile, **options)
@@ -175,35 +175,10 @@ def create_subscription(
     return subscription
 
 
-def create_publisher(
-    node: Node,
-    type_: type[Any],
-    topic: str,
-    qos: QosProfile | QoSProfile,
-    *,
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
-    **options: Any,
-) -> Publisher:
-    """Create a publisher on the node's own participant; arguments as `create_subscription`.
-
-    No RMW gives a publisher flow endpoints of its own: it becomes unique on a `FlowParticipant`.
-
-    Raises:
-        MiddlewareError: STRICTLY_REQUIRED; nothing was made.
-    """
-    if unique is UniqueRequirement.STRICTLY_REQUIRED:
-        reason = "Unique network flow endpoints not supported on publishers"
-        hint = "give the publisher its own participant, or ask for optionally_required"
-        resolved = node.resolve_topic_name(topic)
-        raise _not_feasible("publisher", resolved, unique, reason, hint)
-    return Node.create_publisher(node, type_, topic, to_rclpy(qos), **options)
-
-
-def _not_feasible(
-    kind: str, topic: str, unique: UniqueRequirement, reason: str, hint: str
-) -> MiddlewareError:
+def _not_feasible(topic: str, unique: UniqueRequirement, reason: str, hint: str) -> MiddlewareError:
     return MiddlewareError(
-        f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
+        f"cannot create subscription {topic!r} with network flow endpoints {unique.value}: "
+        f"{reason}",
         hint=hint,
     )
 
@@ -230,7 +205,7 @@ def _unique_handle(
         raise
     # A handle whose init failed is zero inside; rcl's fini accepts that.
     handle.destroy_when_not_in_use()
-    raise _not_feasible("subscription", resolved, unique, refusal, _subscription_hint())
+    raise _not_feasible(resolved, unique, refusal, _subscription_hint())
 
 
 def _made_unique(

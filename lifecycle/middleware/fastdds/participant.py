@@ -23,7 +23,6 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
-from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings, check_endpoint
 from lifecycle.middleware.rcl import abi, hidden_node
 from lifecycle.middleware.rcl.conversions import to_rclpy
@@ -41,14 +40,14 @@ class FlowParticipant:
         name: base name of the hidden node; by ROS custom it starts with an underscore.
         namespace: absolute.
         domain_id: 0–232.
-        dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
+        dscp: 0–63, set on its sender sockets before any user data can leave them; None takes
+            that of its URLs, if they have any.
         served: the node whose executor runs the callbacks of what is made here, gated by its
             callback groups; None leaves them to the executor of `node`.
         **settings: of the participant, see ParticipantSettings.
 
     Attributes:
         node: the hidden node.
-        has_shared_memory: it has that transport.
 
     Raises:
         ConnectionUrlError: a URL that is none.
@@ -69,14 +68,14 @@ class FlowParticipant:
     ) -> None:
         self.name = name
         self.settings = ParticipantSettings(**settings)
-        self._dscp = _one_dscp(dscp, self.settings)
+        asked = (dscp, *(url.dscp for url in self.settings.urls))
+        self._dscp = next((each for each in asked if each is not None), None)
         self._served = served
         self._moved: list[hidden_node.MovedEndpoint] = []
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
         # Without ROS arguments: endpoint names come here resolved.
         self._context: rclpy.Context | None
         self._context, self.node = quiet_node(name, namespace, domain_id, settings=self.settings)
-        self.has_shared_memory = has_shared_memory(self.node)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
             # event publisher lists them before there is any publisher of the user's.
@@ -206,25 +205,3 @@ class FlowParticipant:
 
     def __exit__(self, *_: object) -> None:
         self.destroy()
-
-
-def _one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
-    """Return the requested DSCP, from whichever source; raises MiddlewareError if they differ.
-
-    Only UDP can be marked: Fast DDS opens TCP connections whenever it has something to send and
-    lists none of them (ip(7): a connection is marked by its own socket).
-    """
-    urls = settings.urls
-    if dscp is not None and urls and not any(url.transport.is_udp for url in urls):
-        listed = " and ".join(repr(str(url)) for url in urls)
-        raise MiddlewareError(
-            f"cannot mark what {listed} carries with DSCP {dscp}: only UDP sockets can be marked",
-            hint="remove the mark, or carry it by udpv4://",
-        )
-    asked = dict.fromkeys(each for each in (dscp, *(url.dscp for url in urls)) if each is not None)
-    if len(asked) > 1:
-        raise MiddlewareError(
-            f"cannot mark one participant with DSCPs {' and '.join(map(str, asked))}",
-            hint="give the URLs to different connections",
-        )
-    return next(iter(asked), None)

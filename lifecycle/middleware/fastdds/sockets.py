@@ -12,9 +12,7 @@ kernel puts into packets. A participant's UDP sender sockets all exist before it
 does. TCP connections are opened later, are in no NFE list, and are not marked.
 
 Fast DDS 2.14 never returns from the destruction of a participant whose TCP connection is cut, until
-its socket is shut down; and it never uses a connection whose first answer arrived before the
-connecting thread had noted what to request next: only another participant, on another port, helps
-then.
+its socket is shut down.
 """
 
 from __future__ import annotations
@@ -286,13 +284,6 @@ _UNANSWERED = 2
 _SYN_SENT = 2  # tcp_states.h
 _ESTABLISHED = 1
 _STATE, _RETRANSMITS, _PROBES = 0, 2, 3  # offsets in struct tcp_info
-_LAST_RECEIVED_MS, _BYTES_ACKED, _BYTES_RECEIVED = 52, 120, 128
-
-_FIRST_REQUEST = 100
-"""Bytes; the request by which Fast DDS begins has 68, and the next one 38 more."""
-
-_IDLE_MS = 500
-"""A connection in use says what it wants next within 0.1 s of the first answer."""
 
 
 def give_up_dead_connections() -> int:
@@ -313,26 +304,6 @@ def _connections() -> Iterator[socket.socket]:
     for each in sockets_here():
         if each.type == socket.SOCK_STREAM and each.family in (socket.AF_INET, socket.AF_INET6):
             yield each
-
-
-def is_used(address: str, port: int) -> bool | None:
-    """Return whether the connection that this process dialled there is used by Fast DDS.
-
-    None while that is open: there is no connection yet, or it has only just begun.
-    """
-    for each in _connections():
-        with contextlib.suppress(OSError):  # not connected yet
-            if each.getpeername() == (address, port):
-                return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
-    return None
-
-
-def _is_used(info: bytes) -> bool | None:
-    (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
-    acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
-    if acked >= _FIRST_REQUEST:
-        return True
-    return False if received and idle_ms >= _IDLE_MS else None
 
 
 def _is_dead(each: socket.socket) -> bool:

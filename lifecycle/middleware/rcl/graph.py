@@ -31,7 +31,7 @@ from lifecycle.middleware.fastdds.profiles import (
     FORGOTTEN_S,
     ParticipantSettings,
 )
-from lifecycle.middleware.fastdds.sockets import give_up_dead_connections, is_used
+from lifecycle.middleware.fastdds.sockets import give_up_dead_connections
 from lifecycle.middleware.process.prefixes import (
     PROCESS_DIGITS,
     is_of_host,
@@ -71,12 +71,8 @@ if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
 _PARAMETER_EVENTS = "/parameter_events"
 """rclcpp and rclpy give every node one publisher of it."""
 
-_AGREED_S = 5.0
-"""A server that listens agrees within so long, on a busy machine too."""
-
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
-_LOOK_S = 0.005
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
 
@@ -294,27 +290,6 @@ class GraphObserver:
         """Return the fully qualified names of the services that discovery shows on `node`."""
         listed = endpoints_of_node(self.node, EndpointKind.SERVICE_SERVER, node)
         return frozenset(name for name, _ in listed or ())
-
-    def reaches_servers(self) -> bool:
-        """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
-
-        What Fast DDS has not agreed on with a server by then it never will: only another observer
-        may. Without such servers there is nothing to wait for.
-        """
-        deadline = time.monotonic() + _AGREED_S
-        servers = [
-            (server.address, server.port)
-            for url in self.urls
-            if url.transport.is_tcp
-            for server in url.server
-            if server.port is not None
-        ]
-        for address, port in servers:
-            while not (used := is_used(address, port)):
-                if used is False or time.monotonic() > deadline:
-                    return False
-                time.sleep(_LOOK_S)  # the kernel gives no event
-        return True
 
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         """Count the participants of a process no more, although discovery shows them still.
