@@ -146,7 +146,7 @@ class ServiceCalls:
             is_late = now_s >= deadline
             if offered_s is not None and (is_late or now_s - offered_s >= _UNMATCHED_S):
                 break
-            if is_late:
+            if is_late or self._destroyed:
                 return None
             await asyncio.sleep(min(_MATCH_CHECK_S, deadline - now_s))
         return client
