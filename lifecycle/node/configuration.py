@@ -33,7 +33,7 @@ from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.prefixes import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
-from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
+from lifecycle.middleware.rcl.graph_queries import own_endpoint, prefix_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections
@@ -48,7 +48,6 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
 )
 from lifecycle.verify.outcome import ConnectionReport
-from lifecycle.verify.tool_filter import PREFIX_DIGITS
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -140,7 +139,7 @@ def connection_reports(
             name=connection.name,
             urls=connection.urls or (() if connection.name else spec.connections.urls),
             node_name=connection.node_name,
-            prefix=_prefix_of(connection),
+            prefix="" if connection.node is None else prefix_of(connection.node),
             established=all(each.matched for each in on if each.kind.is_topic),
             mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
         )
@@ -160,7 +159,7 @@ def collect(
     """Return the configuration of a node as it is now."""
     node, state = hosted.node, hosted.reported
     reports = endpoint_reports(node, endpoints)
-    name, prefix = hosted.full_name, _gid_prefix(node)
+    name, prefix = hosted.full_name, prefix_of(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
         identity=Identity(
@@ -240,7 +239,7 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
     witness = connection.node or node
-    info = _own_endpoint(witness, report.resolved, endpoint.kind)
+    info = own_endpoint(witness, endpoint.kind, report.resolved)
     return replace(
         report,
         qos=_actual_qos(entity, info),
@@ -250,43 +249,6 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         nfes=_nfes(witness, endpoint.kind, entity),
         dscp=connection.read_dscp(),
     )
-
-
-def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoint | None:
-    """Return what this process's graph cache says of the node's own endpoint on `topic`.
-
-    It knows own endpoints at once, discovery has no part in it. None if there are several.
-    """
-    name = node.get_fully_qualified_name()
-    own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
-    return own[0] if len(own) == 1 else None
-
-
-def _gid_prefix(node: Node) -> str:
-    """Return the participant's part of the node's GIDs in hex; empty if unknown."""
-    for name in ("~/transition_event", "/parameter_events"):
-        topic = node.resolve_topic_name(name)
-        info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
-        if info is not None:
-            return info.gid[:PREFIX_DIGITS]
-    return ""
-
-
-def _prefix_of(connection: Connection) -> str:
-    """Return the GID prefix of a connection's own participant in hex; empty if unknown.
-
-    Of another process that has a node of this name, this process's graph cache may know too.
-    """
-    node = connection.node
-    if node is None:
-        return ""
-    name = node.get_fully_qualified_name()
-    found: set[str] = set()
-    for kind in (each for each in EndpointKind if not each.is_action):
-        for each, _ in endpoints_of_node(node, kind, name) or ():
-            infos = endpoints_of(node, kind, each)
-            found.update(info.gid[:PREFIX_DIGITS] for info in infos if info.node == name)
-    return found.pop() if len(found) == 1 else ""
 
 
 def _nfes(witness: Node, kind: EndpointKind, entity: Any) -> tuple[NetworkFlowEndpoint, ...] | None:

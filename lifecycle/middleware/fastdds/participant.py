@@ -26,6 +26,7 @@ from lifecycle.middleware.fastdds import nfe, sockets
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings, check_endpoint
 from lifecycle.middleware.rcl import abi, hidden_node
 from lifecycle.middleware.rcl.conversions import to_rclpy
+from lifecycle.middleware.rcl.graph_queries import prefix_of
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.network.nfe import NetworkFlowEndpoint
 
@@ -78,13 +79,15 @@ class FlowParticipant:
         self._context, self.node = quiet_node(name, namespace, domain_id, settings=self.settings)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
-            # event publisher lists them before there is any publisher of the user's.
+            # event publisher lists them before there is any publisher of the user's. By the same
+            # one its GUID prefix is known.
             probe = next(iter(self.node.publishers))
             if self._dscp is not None or not abi.refusal():
                 self._nfes = nfe.senders_of(self.node)
             # No socket of Fast DDS 2.14 opens later (see `sockets`).
             if self._dscp is not None:
                 sockets.set_dscp(self._nfes, self._dscp)
+            prefix_of(self.node)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
         except BaseException:

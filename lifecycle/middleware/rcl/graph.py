@@ -47,6 +47,7 @@ from lifecycle.middleware.rcl.graph_queries import (
     endpoints_of,
     endpoints_of_node,
     nameless_repliers,
+    prefix_of,
     rmw_topics,
     services_of_node,
     topic_names,
@@ -143,7 +144,6 @@ class GraphObserver:
         self._departed_s: dict[ObservedEndpoint, float] = {}  # when each was last shown
         self._dead: frozenset[str] = frozenset()
         self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
-        self._own = ""  # the observer's GUID prefix, once a process has ended
         self._topics_before: frozenset[str] = frozenset()
 
     @classmethod
@@ -209,7 +209,7 @@ class GraphObserver:
         for name in () if OVER_DDS else homes:
             shown.setdefault(name, []).extend(services_of_node(self.node, name))
         named = frozenset(itertools.chain.from_iterable(homes.values()))
-        self.settling.saw(named, next(iter(homes.get(self._name, ())), ""))
+        self.settling.saw(named, self.prefix)
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
         if self.owns_node and counts.get(self._name) == 1:
@@ -267,14 +267,14 @@ class GraphObserver:
     @property
     def prefix(self) -> str:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
-        return self._homes()[1]
+        return prefix_of(self.node)
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Return which of the nodes of this machine are in hosts of ours, see `prefixes`."""
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         found = {}
         for name in nodes:
-            here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
+            here = [each for each in homes.get(name, ()) if is_of_host(each, own)]
             if here:
                 found[name] = all(map(is_vouched_for, here))
         return found
@@ -302,21 +302,21 @@ class GraphObserver:
         """
         if self._destroyed:
             return
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        theirs = (each for each in claimed if own and is_of_process(each, pid, own))
+        theirs = (each for each in claimed if is_of_process(each, pid, own))
         now_s = time.monotonic()
         lately = {each: at for each, at in self._ended_until_s.items() if at > now_s}
-        self._ended_until_s, self._own = {**lately, pid: now_s + FORGOTTEN_S}, own
-        self._count_no_more(theirs, own)
+        self._ended_until_s = {**lately, pid: now_s + FORGOTTEN_S}
+        self._count_no_more(theirs)
         self._guard.notify()  # what it had made may be without a name yet
 
     def ended_participant(self, prefix: str) -> None:
         """Count participants of an ended process no more, by the GUID prefix of one of them."""
-        self._count_no_more((prefix,), self.prefix)
+        self._count_no_more((prefix,))
 
-    def _count_no_more(self, prefixes: Iterable[str], own: str) -> None:
-        ended = {each[:PROCESS_DIGITS] for each in prefixes} - {own[:PROCESS_DIGITS]}
+    def _count_no_more(self, prefixes: Iterable[str]) -> None:
+        ended = {each[:PROCESS_DIGITS] for each in prefixes} - {self.prefix[:PROCESS_DIGITS]}
         if not ended <= self._dead:
             self._dead |= ended
             self._guard.notify()
@@ -324,22 +324,22 @@ class GraphObserver:
     def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
         if endpoint.gid[:PROCESS_DIGITS] in self._dead:
             return True
-        if endpoint.node or not self._own:
+        if endpoint.node or not self._ended_until_s:
             return False
         # A process that was killed before the name of its node was known has reported nothing.
         now_s, prefix = time.monotonic(), endpoint.gid[:PREFIX_DIGITS]
         return any(
-            now_s < until_s and is_of_process(prefix, pid, self._own)
+            now_s < until_s and is_of_process(prefix, pid, self.prefix)
             for pid, until_s in self._ended_until_s.items()
         )
 
-    def _homes(self) -> tuple[dict[str, set[str]], str]:
-        """Return by full name the prefixes of the participants that nodes are on, and our own."""
+    def _homes(self) -> dict[str, set[str]]:
+        """Return by full name the prefixes of the participants that nodes are on."""
         homes: dict[str, set[str]] = {}
         for each in endpoints_of(self.node, EndpointKind.PUBLISHER, _PARAMETER_EVENTS):
             if each.node and not self._is_dead(each):
                 homes.setdefault(each.node, set()).add(each.gid[:PREFIX_DIGITS])
-        return homes, next(iter(homes.get(self._name, ())), "")
+        return homes
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started, by node and GUID prefix.
@@ -348,7 +348,7 @@ class GraphObserver:
         """
         from lifecycle.middleware.process.process_table import programs_of
 
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         if not own:
             return {}
         known = programs_of((each for home in homes.values() for each in home), own, environment)

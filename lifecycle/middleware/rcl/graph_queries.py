@@ -8,9 +8,11 @@ verified.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator
 
 from msgspec.structs import replace
+from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -22,7 +24,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import UNKNOWN_QOS
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.verify.observation import ObservedEndpoint
-from lifecycle.verify.tool_filter import known_node
+from lifecycle.verify.tool_filter import PREFIX_DIGITS, known_node
 
 RAW = "dds:"
 """What names of topics begin with here that are no names of ROS."""
@@ -51,6 +53,33 @@ def endpoints_of(node: Node, kind: EndpointKind, name: str) -> list[ObservedEndp
     """
     pattern = _TOPIC if kind.is_topic else _REQUEST
     return _read(node, kind, name, pattern.format(name))
+
+
+def own_endpoint(node: Node, kind: EndpointKind, name: str) -> ObservedEndpoint | None:
+    """Return the endpoint that `node` itself has of a kind and name; None if it has several.
+
+    A participant knows its own at once: discovery has no part in it.
+    """
+    full_name = node.get_fully_qualified_name()
+    own = [each for each in endpoints_of(node, kind, name) if each.node == full_name]
+    return own[0] if len(own) == 1 else None
+
+
+_PREFIXES: weakref.WeakKeyDictionary[Context, str] = weakref.WeakKeyDictionary()
+
+
+def prefix_of(node: Node) -> str:
+    """Return the GID prefix of a node's participant, 24 hex digits; empty if unknown.
+
+    Ask for it first while its publisher of parameter events is there.
+    """
+    if node.context not in _PREFIXES:
+        topic = node.resolve_topic_name("/parameter_events")
+        own = own_endpoint(node, EndpointKind.PUBLISHER, topic)
+        if own is None:
+            return ""
+        _PREFIXES[node.context] = own.gid[:PREFIX_DIGITS]
+    return _PREFIXES[node.context]
 
 
 def with_reply(node: Node, requests: list[ObservedEndpoint]) -> list[ObservedEndpoint]:

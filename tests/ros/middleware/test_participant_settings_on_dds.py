@@ -305,6 +305,7 @@ import sys
 from std_msgs.msg import String
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
 for transports in ((), ("udpv4",), ()):
