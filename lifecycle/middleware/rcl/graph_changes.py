@@ -10,6 +10,7 @@ knows of (rmw_service_server_is_available.cpp, rcl_action_server_is_available).
 from __future__ import annotations
 
 import atexit
+import functools
 import logging
 import threading
 import typing
@@ -59,7 +60,8 @@ class GraphGuard:
         self.failure: MiddlewareError | None = None
         self._lock = threading.Lock()
         self._callbacks: dict[object, tuple[Node, Callback]] = {}
-        self._watch: _Watch | None = None
+        self._node: Node | None = None  # through which it watches
+        self._end: Callable[[], None] = lambda: None
 
     @classmethod
     def of(cls, node: Node) -> GraphGuard:
@@ -87,7 +89,7 @@ class GraphGuard:
         """
         key = object()
         with self._lock:
-            if self._watch is None:
+            if self._node is None:
                 self._start(node)
             self._callbacks = {**self._callbacks, key: (node, callback)}
         return lambda: self._remove(key)
@@ -102,7 +104,7 @@ class GraphGuard:
         with self._lock:
             self._callbacks = {other: it for other, it in self._callbacks.items() if other != key}
             nodes = [node for node, _ in self._callbacks.values()]
-            if self._watch is None or self._watch.node in nodes:
+            if self._node in (None, *nodes):
                 return
             self._stop()
             if nodes:
@@ -110,26 +112,58 @@ class GraphGuard:
                 self.notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
-        watch = _Watch(node)
-        self._watch, self.failure = watch, None
-        watch.thread = threading.Thread(
-            target=self._run, args=[watch], name="graph-guard", daemon=True
-        )
-        watch.thread.start()
+        stopped, wake = threading.Event(), None
+        watch = functools.partial(self._look_often, stopped)
+        if not abi.refusal():
+            wake = GuardCondition(None, None, context=node.context)
+            guards = abi.GuardWait(node.context.handle.pointer, 2)
+            watch = functools.partial(self._wait, node, guards, wake, stopped)
+        thread = threading.Thread(target=watch, name="graph-guard", daemon=True)
+        thread.start()
+
+        def end() -> None:
+            stopped.set()
+            if wake is not None:
+                wake.trigger()
+            thread.join()
+
+        self._node, self._end, self.failure = node, end, None
 
     def _stop(self) -> None:
-        if self._watch is not None:
-            self._watch.stop()
-            self._watch.thread.join()
-            self._watch = None
+        if self._node is not None:
+            self._node = None
+            self._end()
 
-    def _run(self, watch: _Watch) -> None:
+    def _look_often(self, stopped: threading.Event) -> None:
+        while not stopped.wait(_UNKNOWN_S):
+            self.notify()
+
+    def _wait(
+        self, node: Node, guards: abi.GuardWait, wake: GuardCondition, stopped: threading.Event
+    ) -> None:
+        """Notify after each change, and while a callback returns True after ever longer pauses."""
+        graph = abi.load().call["rcl_node_get_graph_guard_condition"](node.handle.pointer)
+        pause_s: float | None = None
         try:
-            watch.run(self.notify)
+            # Meanwhile rclpy frees nothing of what is waited for.
+            with node.context.handle, node.handle, wake.handle:
+                while True:
+                    changed = guards.wait((graph, wake.handle.pointer), pause_s)
+                    if stopped.is_set():
+                        return
+                    if not self.notify():
+                        pause_s = None
+                    elif changed or pause_s is None:
+                        pause_s = _SOON_S
+                    else:
+                        pause_s = min(2 * pause_s, _AGAIN_S)
         except MiddlewareError as error:
             _logger.exception("the graph is no longer watched")
             self.failure = error
             self.notify()
+        finally:
+            guards.close()
+            wake.destroy()
 
     def notify(self) -> bool:
         """Call all back, in this thread; return whether any is to be called again."""
@@ -154,51 +188,6 @@ def _let_go() -> None:
     """Leave no thread in rcl when the interpreter ends: it would keep the participant alive."""
     for guard in tuple(_guards.values()):
         guard.close()
-
-
-class _Watch:
-    """Waits in `thread` for changes of the graph that a node sees, until it is stopped."""
-
-    def __init__(self, node: Node) -> None:
-        self.node = node
-        self.thread: threading.Thread
-        self._stopped = threading.Event()
-        self._guards: abi.GuardWait | None = None
-        if not abi.refusal():
-            self._graph = abi.load().call["rcl_node_get_graph_guard_condition"](node.handle.pointer)
-            self._wake = GuardCondition(None, None, context=node.context)
-            self._guards = abi.GuardWait(node.context.handle.pointer, 2)
-
-    def run(self, notify: Callable[[], bool]) -> None:
-        """Call `notify` after each change, and while it returns True after ever longer pauses."""
-        if self._guards is None:
-            while not self._stopped.wait(_UNKNOWN_S):
-                notify()
-            return
-        pause_s: float | None = None
-        try:
-            # Meanwhile rclpy frees nothing of what is waited for.
-            with self.node.context.handle, self.node.handle, self._wake.handle:
-                while True:
-                    guards = self._graph, self._wake.handle.pointer
-                    changed = self._guards.wait(guards, pause_s)
-                    if self._stopped.is_set():
-                        return
-                    if not notify():
-                        pause_s = None
-                    elif changed or pause_s is None:
-                        pause_s = _SOON_S
-                    else:
-                        pause_s = min(2 * pause_s, _AGAIN_S)
-        finally:
-            self._guards.close()
-            self._wake.destroy()
-
-    def stop(self) -> None:
-        """Have it end, now or later."""
-        self._stopped.set()
-        if self._guards is not None:
-            self._wake.trigger()
 
 
 _COUNTING_BOTH_WAYS = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")

@@ -94,7 +94,6 @@ class Heartbeat:
         self._last_s: dict[Node, float] = {}
         self._changing: set[str] = set()
         self._runs = False
-        sign.speak_for_process()
 
     def run(self, *, runs: bool) -> None:
         """Watch from now on, as the executor runs, or nothing any more."""
@@ -145,7 +144,7 @@ class Heartbeat:
             self._sign.end()
         else:
             due_s = min(self._last_s.values()) + self._period_s
-            self._sign.begin(due_s - time.monotonic())
+            self._sign.begin(due_s - time.monotonic(), for_process=True)
 
 
 _BEATS = 5
