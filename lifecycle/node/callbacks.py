@@ -153,7 +153,10 @@ async def result_of(running: Running, *, what: str, deadline_s: float) -> Result
     took_s = time.monotonic() - began
     failure = running.failure or (running.interruption if running.awaits else None)
     if failure is not None:
-        return _raised(failure, running.trace, what=what)
+        text = str(failure)
+        if not isinstance(failure, LifecycleError):
+            text = f"{what} raised {error_text(failure)}"
+        return Result(outcome=CallbackOutcome.ERROR, error=text, trace=running.trace)
     if took_s >= deadline_s and not running.awaits:
         return Result(
             outcome=CallbackOutcome.ERROR,
@@ -161,13 +164,6 @@ async def result_of(running: Running, *, what: str, deadline_s: float) -> Result
             f"{deadline_s:g} s; make it `async def` so that it can be interrupted",
         )
     return judge(running.returned, what=what)
-
-
-def _raised(error: Exception, trace: str, *, what: str) -> Result:
-    text = str(error)
-    if not isinstance(error, LifecycleError):
-        text = f"{what} raised {error_text(error)}"
-    return Result(outcome=CallbackOutcome.ERROR, error=text, trace=trace)
 
 
 def error_text(error: Exception) -> str:

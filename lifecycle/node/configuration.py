@@ -158,7 +158,10 @@ def collect(
 ) -> NodeConfiguration:
     """Return the configuration of a node as it is now."""
     node, state = hosted.node, hosted.reported
-    reports = endpoint_reports(node, endpoints)
+    reports = []
+    for each in endpoints:
+        with contextlib.suppress(InvalidHandle):  # it is being destroyed
+            reports.append(_endpoint_report(node, each))
     name, prefix = hosted.full_name, prefix_of(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
@@ -175,7 +178,7 @@ def collect(
         or tuple(sorted({nfe.medium for each in reports for nfe in each.nfes or ()})),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
-        endpoints=reports,
+        endpoints=tuple(reports),
         connections=connection_reports(hosted.spec, hosted.connections, reports),
         parameters=parameter_reports(node),
         health=health,
@@ -197,15 +200,6 @@ def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackG
         return response
 
     Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
-
-
-def endpoint_reports(node: Node, endpoints: Iterable[Endpoint]) -> tuple[EndpointReport, ...]:
-    """Return what the endpoints of a node are now, without those that are being destroyed."""
-    reports: list[EndpointReport] = []
-    for each in endpoints:
-        with contextlib.suppress(InvalidHandle):
-            reports.append(_endpoint_report(node, each))
-    return tuple(reports)
 
 
 def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:

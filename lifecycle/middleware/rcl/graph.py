@@ -125,7 +125,7 @@ class GraphObserver:
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
         self._clock: Subscription[Any] | None = None
-        self._time_came = self._clock_closed = False
+        self._time_came = False
         self._context: rclpy.Context | None = None
         if node is None:
             name = f"_lifecycle_observer_{os.getpid()}"
@@ -384,13 +384,11 @@ class GraphObserver:
             self._clock = self.node.create_subscription(
                 Clock, CLOCK[0], self._take_time, qos_profile_sensor_data
             )
-        elif self._time_came and not self._clock_closed:
-            self._clock_closed = True
-            self.node.destroy_subscription(self._clock)
 
     def _take_time(self, _: object) -> None:
         if not self._time_came:
             self._time_came = True
+            self.node.destroy_subscription(self._clock)
             self._guard.notify()
 
     def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:

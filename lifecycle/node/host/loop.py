@@ -188,7 +188,13 @@ class NodeLoop:
         self._watchdog: Watchdog | None = None
         self._heartbeat: Heartbeat | None = None
         if executor is not Executor.SINGLE:
-            self._own = _executor(executor, threads, context)
+            if executor is Executor.EVENTS:
+                from rclpy.experimental.events_executor import EventsExecutor
+
+                self._own = EventsExecutor(context=context)
+            else:
+                count = threads or max(2, os.cpu_count() or 0)
+                self._own = MultiThreadedExecutor(count, context=context)
             self._heartbeat = Heartbeat(sign, on_overlong) if sign else None
         elif sign is not None:
             self._watchdog = Watchdog(sign, on_overlong)
@@ -355,15 +361,6 @@ class NodeLoop:
         )
         sys.stderr.flush()
         os._exit(self._code or 1)
-
-
-def _executor(kind: Executor, threads: int, context: Context) -> Any:
-    """Return rclpy's executor of a kind that has threads of its own."""
-    if kind is Executor.EVENTS:
-        from rclpy.experimental.events_executor import EventsExecutor
-
-        return EventsExecutor(context=context)
-    return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
 @contextlib.contextmanager
