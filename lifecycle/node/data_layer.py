@@ -27,14 +27,16 @@ from lifecycle.node.endpoint import (
     Placement,
     UnknownEndpointError,
     count_peers,
+    expand,
     find_endpoint,
+    make_entity,
     refuse_unfit,
+    unmake,
     watch_matches,
 )
 from lifecycle.node.gate import DeclaredPublisher, Kept
 from lifecycle.node.handlers import Key, alternatives, needs_handler
 from lifecycle.node.machine import NodeState
-from lifecycle.node.making import expand, make_entity, unmake
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:

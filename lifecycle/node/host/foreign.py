@@ -35,10 +35,9 @@ from lifecycle.node import configuration
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
-from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
+from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, factory, watch_matches
 from lifecycle.node.gate import GatedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
-from lifecycle.node.making import factory
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
