@@ -30,7 +30,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
-from lifecycle.middleware.process.prefixes import vouch_for
+from lifecycle.middleware.process.process_table import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import own_endpoint, prefix_of

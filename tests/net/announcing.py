@@ -12,9 +12,9 @@ import sys
 from std_msgs.msg import String
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.fastdds.participant import republish_names
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.rcl.graph_queries import endpoints_of
-from lifecycle.middleware.rcl.hidden_node import republish_names
 from lifecycle.plan.model import ParticipantConnections
 
 

@@ -25,6 +25,7 @@ from rclpy.subscription import Subscription
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import is_served, reach, settle_s
 from lifecycle.middleware.fastdds.factory import observer_settings
+from lifecycle.middleware.fastdds.participant import quiet_node
 from lifecycle.middleware.fastdds.prober import Settling
 from lifecycle.middleware.fastdds.profiles import (
     DISCOVERY_SERVER_VARIABLE,
@@ -32,7 +33,7 @@ from lifecycle.middleware.fastdds.profiles import (
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.sockets import give_up_dead_connections
-from lifecycle.middleware.process.prefixes import (
+from lifecycle.middleware.process.process_table import (
     PROCESS_DIGITS,
     is_of_host,
     is_of_process,
@@ -54,7 +55,6 @@ from lifecycle.middleware.rcl.graph_queries import (
     unreadable,
     with_reply,
 )
-from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import (

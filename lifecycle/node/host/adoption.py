@@ -21,10 +21,10 @@ from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import reach
 from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.participant import made_participant
 from lifecycle.middleware.fastdds.prober import Prober
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.graph_queries import OVER_DDS
-from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import is_rclpy_managed, noted_action
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.managed import Managed

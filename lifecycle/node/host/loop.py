@@ -30,9 +30,9 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
+from lifecycle.middleware.fastdds.participant import hidden_nodes, republish_names
 from lifecycle.middleware.process.busy_sign import BusySign, show_stacks_here
 from lifecycle.middleware.process.control import leave_and_exit
-from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import NodeExecutor, Watching, described, run
 from lifecycle.node.callbacks import hint
 from lifecycle.node.managed import Managed
