@@ -326,6 +326,7 @@ class Goals:
 
     def __init__(self, managed: Managed, endpoint: Endpoint) -> None:
         assert endpoint.handler is not None
+        self._managed = managed
         self._node = managed.full_name
         self._endpoint = endpoint
         self._what = f"action server {endpoint.name!r} of {self._node}"
@@ -333,7 +334,6 @@ class Goals:
         self._handler = endpoint.handler
         self._accept = getattr(endpoint.handler, "accept", None)
         self._gate = managed.gate
-        self._changed = managed.configuration_changes.touch
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None  # set by its maker, before it can have a goal
 
@@ -403,11 +403,7 @@ class Goals:
         failure = run.failure
         if run.interruption is not None and isinstance(failure, GoalInterruptedError):
             return None
-        fault = "" if failure is None else f"its handler raised {error_text(failure)}"
-        if fault != self._endpoint.fault:
-            self._endpoint.fault = fault
-            self._changed()
-        if fault:
+        if fault := self._managed.note_fault(self._endpoint, failure):
             self._log.error(run.trace)
             self._log.error(f"cannot go on with a goal of {self._what}: {fault}")
             return None

@@ -245,24 +245,20 @@ def _address(text: str) -> str:
 
 def _becomes_free(kind: Medium, address: str, port: int) -> bool:
     deadline = time.monotonic() + _RELEASED_S
-    while not (is_free := _is_free(kind, address, port)) and time.monotonic() < deadline:
-        time.sleep(0.001)
-    return is_free
-
-
-def _is_free(kind: Medium, address: str, port: int) -> bool:
-    with socket.socket(kind.socket_family, _TYPE[kind.is_tcp]) as probe:
-        if kind.is_tcp:  # as Fast DDS does: connections that are over are not in the way
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if kind.ip_version == 6:
-            probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        try:
-            probe.bind((address or kind.any_address, port))
-            if kind.is_tcp:
-                probe.listen()
-        except OSError:
+    while True:
+        with socket.socket(kind.socket_family, _TYPE[kind.is_tcp]) as probe:
+            if kind.is_tcp:  # as Fast DDS does: connections that are over are not in the way
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if kind.ip_version == 6:
+                probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            with contextlib.suppress(OSError):
+                probe.bind((address or kind.any_address, port))
+                if kind.is_tcp:
+                    probe.listen()
+                return True
+        if time.monotonic() >= deadline:
             return False
-    return True
+        time.sleep(0.001)
 
 
 def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:

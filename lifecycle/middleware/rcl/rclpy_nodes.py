@@ -67,7 +67,7 @@ def _action_name(node: Node, kind: EndpointKind, action: Any) -> str:
     return next(iter(new or listed), "")  # a second client of a name brings none
 
 
-def follow_goals(server: Any, ended: Callable[[Exception | None], None]) -> None:
+def follow_goals(server: Any, ended: Callable[[Exception | None], object]) -> None:
     """Call back at the end of each goal with what the handler of an action server raised, or None.
 
     Where rclpy keeps the handler otherwise than is known, nothing is called.

@@ -32,7 +32,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
-from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, factory, watch_matches
@@ -132,14 +132,7 @@ class ForeignNode(NodeInHost):
         placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
         endpoint = self.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
-            follow_goals(entity, functools.partial(self._goal_ended, endpoint))
-
-    def _goal_ended(self, endpoint: Endpoint, error: Exception | None) -> None:
-        """Keep what the handler of an action raised at its last goal."""
-        fault = "" if error is None else f"its handler raised {error_text(error)}"
-        if fault != endpoint.fault:
-            endpoint.fault = fault
-            self.configuration_changes.touch()
+            follow_goals(entity, functools.partial(self.note_fault, endpoint))
 
     def _watch_matches(self, kind: EndpointKind, entity: Any) -> Callable[[], None]:
         """Watch in the host's executor, for the node's own need not run; returns what ends that."""
