@@ -216,7 +216,7 @@ class Adoption:
         entity = foreign.make(kind, given) if names else None
         if entity is None:
             entity = make(node, *arguments, **options)
-        foreign.made(kind, entity)
+            foreign.made(kind, entity)
         return entity
 
     def _remove(self, destroy: Callable[..., Any], node: Node, entity: Any) -> Any:

@@ -79,7 +79,6 @@ class ForeignNode(NodeInHost):
         self._group = ReentrantCallbackGroup()
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self.connections = Connections(node, spec.participants)
-        self._apart: dict[int, Connection] = {}  # by id of what is being made on others
         self._is_spun = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
@@ -114,7 +113,7 @@ class ForeignNode(NodeInHost):
 
     # What its class makes.
 
-    def made(self, kind: EndpointKind, entity: Any) -> None:
+    def made(self, kind: EndpointKind, entity: Any, connection: Connection | None = None) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
@@ -128,8 +127,9 @@ class ForeignNode(NodeInHost):
             unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
-        connection = self._apart.pop(id(entity), self.connections.own)
-        placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
+        placement = Placement(
+            connection=connection or self.connections.own, entity=entity, unwatch=unwatch
+        )
         endpoint = self.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
             follow_goals(entity, functools.partial(self.note_fault, endpoint))
@@ -187,7 +187,7 @@ class ForeignNode(NodeInHost):
         topic = given["topic"] if connection.participant is None else planned.resolved
         create = factory(planned, connection, self.node)
         entity = create(given["msg_type"], topic, *called, **options)
-        self._apart[id(entity)] = connection
+        self.made(kind, entity, connection)
         return entity
 
     def _planned(self, kind: EndpointKind, topic: object) -> PlannedEndpoint | None:
