@@ -32,8 +32,7 @@ from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_end
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.process_table import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
-from lifecycle.middleware.rcl.graph_changes import is_server_matched
-from lifecycle.middleware.rcl.graph_queries import own_endpoint, prefix_of
+from lifecycle.middleware.rcl.graph_queries import is_server_matched, own_endpoint, prefix_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections

@@ -18,7 +18,7 @@ from rclpy.task import Future
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.conversions import import_interface
-from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import ServerWatch
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoint import (

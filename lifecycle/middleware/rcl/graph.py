@@ -39,11 +39,11 @@ from lifecycle.middleware.process.process_table import (
     is_of_process,
     is_vouched_for,
 )
-from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import (
     OF_SERVICES,
     OVER_DDS,
     RAW,
+    GraphGuard,
     endpoints_in,
     endpoints_of,
     endpoints_of_node,

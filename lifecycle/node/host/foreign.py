@@ -23,7 +23,7 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
