@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from lifecycle.public import public_name
 
 if TYPE_CHECKING:
-    from lifecycle.node.actions import GoalInterruptedError
+    from lifecycle.node.callbacks import GoalInterruptedError
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
     from lifecycle.node.node import (
@@ -39,7 +39,7 @@ __all__ = [
 
 
 _PUBLIC: dict[str, tuple[str, ...]] = {
-    "lifecycle.node.actions": ("GoalInterruptedError",),
+    "lifecycle.node.callbacks": ("GoalInterruptedError",),
     "lifecycle.node.handlers": (
         "on_action",
         "on_goal",

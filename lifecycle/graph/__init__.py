@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING
 from lifecycle.public import public_name
 
 if TYPE_CHECKING:
-    from lifecycle.graph.events import EventKind as EventKind
-    from lifecycle.graph.events import GraphEvent as GraphEvent
-    from lifecycle.graph.events import GraphEvents as GraphEvents
     from lifecycle.graph.graph import Graph as Graph
     from lifecycle.graph.model import End as End
     from lifecycle.graph.model import EndpointChange as EndpointChange
@@ -24,6 +21,9 @@ if TYPE_CHECKING:
     from lifecycle.graph.model import NodeView as NodeView
     from lifecycle.graph.reporter import GraphReporter as GraphReporter
     from lifecycle.graph.reporter import receive as receive
+    from lifecycle.graph.state import EventKind as EventKind
+    from lifecycle.graph.state import GraphEvent as GraphEvent
+    from lifecycle.graph.state import GraphEvents as GraphEvents
     from lifecycle.graph.state import GraphState as GraphState
     from lifecycle.graph.status import MappingStatus as MappingStatus
     from lifecycle.graph.status import NodeStatus as NodeStatus
@@ -33,11 +33,10 @@ if TYPE_CHECKING:
     from lifecycle.graph.status import new_instance as new_instance
 
 _PUBLIC: dict[str, tuple[str, ...]] = {
-    "lifecycle.graph.events": ("EventKind", "GraphEvent", "GraphEvents"),
     "lifecycle.graph.graph": ("Graph",),
     "lifecycle.graph.model": ("End", "EndpointChange", "GraphChange", "Link", "NodeView"),
     "lifecycle.graph.reporter": ("GraphReporter", "receive"),
-    "lifecycle.graph.state": ("GraphState",),
+    "lifecycle.graph.state": ("EventKind", "GraphEvent", "GraphEvents", "GraphState"),
     "lifecycle.graph.status": (
         "MappingStatus",
         "NodeStatus",

@@ -20,7 +20,6 @@ from msgspec.structs import replace
 from rclpy.node import Node
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.loop import GraphLoop, set_within
 from lifecycle.graph.model import GraphChange
 from lifecycle.graph.readings import (
@@ -30,7 +29,7 @@ from lifecycle.graph.readings import (
     TopicMeasurements,
 )
 from lifecycle.graph.reporter import receive
-from lifecycle.graph.state import Answer, GraphState
+from lifecycle.graph.state import Answer, GraphEvents, GraphState
 from lifecycle.graph.status import NodeStatus
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients

@@ -27,12 +27,12 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
-from lifecycle.middleware.process.prefixes import vouch_for
+from lifecycle.middleware.process.process_table import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
-from lifecycle.middleware.rcl.graph_changes import is_server_matched
-from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
+from lifecycle.middleware.rcl.graph_queries import is_server_matched, own_endpoint, prefix_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections
@@ -47,7 +47,6 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
 )
 from lifecycle.verify.outcome import ConnectionReport
-from lifecycle.verify.tool_filter import PREFIX_DIGITS
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -139,7 +138,7 @@ def connection_reports(
             name=connection.name,
             urls=connection.urls or (() if connection.name else spec.connections.urls),
             node_name=connection.node_name,
-            prefix=_prefix_of(connection),
+            prefix="" if connection.node is None else prefix_of(connection.node),
             established=all(each.matched for each in on if each.kind.is_topic),
             mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
         )
@@ -158,8 +157,11 @@ def collect(
 ) -> NodeConfiguration:
     """Return the configuration of a node as it is now."""
     node, state = hosted.node, hosted.reported
-    reports = endpoint_reports(node, endpoints)
-    name, prefix = hosted.full_name, _gid_prefix(node)
+    reports = []
+    for each in endpoints:
+        with contextlib.suppress(InvalidHandle):  # it is being destroyed
+            reports.append(_endpoint_report(node, each))
+    name, prefix = hosted.full_name, prefix_of(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
         identity=Identity(
@@ -175,7 +177,7 @@ def collect(
         or tuple(sorted({nfe.medium for each in reports for nfe in each.nfes or ()})),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
-        endpoints=reports,
+        endpoints=tuple(reports),
         connections=connection_reports(hosted.spec, hosted.connections, reports),
         parameters=parameter_reports(node),
         health=health,
@@ -197,15 +199,6 @@ def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackG
         return response
 
     Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
-
-
-def endpoint_reports(node: Node, endpoints: Iterable[Endpoint]) -> tuple[EndpointReport, ...]:
-    """Return what the endpoints of a node are now, without those that are being destroyed."""
-    reports: list[EndpointReport] = []
-    for each in endpoints:
-        with contextlib.suppress(InvalidHandle):
-            reports.append(_endpoint_report(node, each))
-    return tuple(reports)
 
 
 def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
@@ -239,65 +232,26 @@ def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
     witness = connection.node or node
-    info = _own_endpoint(witness, report.resolved, endpoint.kind)
+    info = own_endpoint(witness, endpoint.kind, report.resolved)
     return replace(
         report,
         qos=_actual_qos(entity, info),
         gid=info.gid if info is not None else "",
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
-        nfes=_nfes(witness, endpoint.kind, entity, connection),
+        nfes=_nfes(witness, endpoint.kind, entity),
         dscp=connection.read_dscp(),
     )
 
 
-def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoint | None:
-    """Return what this process's graph cache says of the node's own endpoint on `topic`.
-
-    It knows own endpoints at once, discovery has no part in it. None if there are several.
-    """
-    name = node.get_fully_qualified_name()
-    own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
-    return own[0] if len(own) == 1 else None
-
-
-def _gid_prefix(node: Node) -> str:
-    """Return the participant's part of the node's GIDs in hex; empty if unknown."""
-    for name in ("~/transition_event", "/parameter_events"):
-        topic = node.resolve_topic_name(name)
-        info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
-        if info is not None:
-            return info.gid[:PREFIX_DIGITS]
-    return ""
-
-
-def _prefix_of(connection: Connection) -> str:
-    """Return the GID prefix of a connection's own participant in hex; empty if unknown.
-
-    Of another process that has a node of this name, this process's graph cache may know too.
-    """
-    node = connection.node
-    if node is None:
-        return ""
-    name = node.get_fully_qualified_name()
-    found: set[str] = set()
-    for kind in (each for each in EndpointKind if not each.is_action):
-        for each, _ in endpoints_of_node(node, kind, name) or ():
-            infos = endpoints_of(node, kind, each)
-            found.update(info.gid[:PREFIX_DIGITS] for info in infos if info.node == name)
-    return found.pop() if len(found) == 1 else ""
-
-
-def _nfes(
-    witness: Node, kind: EndpointKind, entity: Any, connection: Connection
-) -> tuple[NetworkFlowEndpoint, ...] | None:
+def _nfes(witness: Node, kind: EndpointKind, entity: Any) -> tuple[NetworkFlowEndpoint, ...] | None:
     """Return all NFEs of an endpoint; rmw_fastrtps lists shared memory of subscriptions only."""
     publishes = kind is EndpointKind.PUBLISHER
     try:
         nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
     except MiddlewareError:
         return None  # "unknown to the RMW" is a value here, and the verifier's to judge
-    if publishes and connection.has_shared_memory:
+    if publishes and has_shared_memory(witness):
         return (*nfes, SHARED_MEMORY)
     return nfes
 

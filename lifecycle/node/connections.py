@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from lifecycle.errors import LifecycleError, MiddlewareError, nearest
-from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.network.connection_url import ConnectionUrl
@@ -60,7 +59,6 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
     urls: tuple[str, ...] = ()
     node_name: str = ""
     participant: FlowParticipant | None = None
-    has_shared_memory: bool = False
     warning: str = ""
     error: str = ""
 
@@ -85,7 +83,7 @@ class Connections:
     def __init__(self, node: Node, planned: Iterable[PlannedParticipant]) -> None:
         self._node = node
         self._planned = {each.name: each for each in planned}
-        self.own = Connection(name="", has_shared_memory=has_shared_memory(node))
+        self.own = Connection(name="")
         self._made: dict[str, Connection] = {}  # by name of the hidden node
         self._failed: dict[str, Connection] = {}  # by name
         with contextlib.suppress(MiddlewareError):
@@ -231,7 +229,6 @@ class Connections:
             urls=how.urls,
             node_name=planned.name,
             participant=participant,
-            has_shared_memory=participant.has_shared_memory,
             warning=warning,
         )
         self._failed.pop(name, None)

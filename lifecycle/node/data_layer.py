@@ -8,6 +8,7 @@ control channel: "Node Interface" of *Topological Discovery and Communication Ne
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from rclpy.task import Future
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.conversions import import_interface
-from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import ServerWatch
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoint import (
@@ -27,14 +28,16 @@ from lifecycle.node.endpoint import (
     Placement,
     UnknownEndpointError,
     count_peers,
+    expand,
     find_endpoint,
+    make_entity,
     refuse_unfit,
+    unmake,
     watch_matches,
 )
 from lifecycle.node.gate import DeclaredPublisher, Kept
 from lifecycle.node.handlers import Key, alternatives, needs_handler
 from lifecycle.node.machine import NodeState
-from lifecycle.node.making import expand, make_entity, unmake
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -445,7 +448,8 @@ class DataLayer:
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
+            changed = functools.partial(self._server_changed, entity)
+            unwatch = ServerWatch(connection.node or self._node, entity, changed).stop
         return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
@@ -459,6 +463,12 @@ class DataLayer:
             endpoint.handover.peers_changed(_peers(endpoint))
         self._changed()  # as many peers as before may be others
 
+    def _server_changed(self, client: Any) -> None:
+        """The server of a client was matched or unmatched; in a thread of the graph."""
+        if send_held := getattr(client, "send_held", None):
+            self._turns.call_soon(send_held)
+        self._changed()
+
     def _tidy(self) -> None:
         used = [each.connection for each in self.endpoints.values()]
         used += [each.handover.old.connection for each in self.endpoints.values() if each.handover]
@@ -467,11 +477,18 @@ class DataLayer:
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets."""
         publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
-        if connection.participant is None or endpoint.kind is not publisher:
+        if endpoint.kind is not publisher:
             return
-        others = [each for each in self.endpoints.values() if each.connection is connection]
-        for other in others:
-            if other is endpoint or other.kind is not publisher:
+        if connection.participant is None:
+            if endpoint.planned.unique is strict:
+                raise ConnectError(
+                    f"publisher {endpoint.name!r} must have a network flow for itself "
+                    "(strictly_required), and those of the node's own participant share one",
+                    hint="give it a connection of its own",
+                )
+            return
+        for other in self.endpoints.values():
+            if other is endpoint or (other.kind, other.connection) != (publisher, connection):
                 continue
             for one, two in ((endpoint, other), (other, endpoint)):
                 if one.planned.unique is strict:

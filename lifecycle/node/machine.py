@@ -325,7 +325,10 @@ class Machine:
         with self._lock:
             argument = self._node.callback_argument(self.state)
             self.is_permitted = permitted
-            result = self._request(request)
+            try:
+                result = self._take(request)
+            except transitions.MachineError as error:
+                raise RefusedError(self._refusal(request)) from error
         returned = self._reported(result, SUCCESS)
         while not self.state.steady:
             if result.outcome is CallbackOutcome.SUCCESS:
@@ -347,15 +350,11 @@ class Machine:
             return SUCCESS
         return await self.change("shutdown")
 
-    def _request(self, request: str) -> Result:
-        """Begin a transition; what its row cannot do is a failure, as if the callback said so."""
-        try:
-            return self._take(request)
-        except transitions.MachineError as error:
-            raise RefusedError(self._refusal(request)) from error
-
     def _take(self, trigger: str) -> Result:
-        """Change the state by a row of the table, with what the row runs."""
+        """Change the state by a row of the table, with what the row runs.
+
+        What the row of a request cannot do is a failure, as if the callback said so.
+        """
         state = self.state
         try:
             self._machine.events[trigger].trigger(self)

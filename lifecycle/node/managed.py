@@ -13,7 +13,13 @@ from rclpy.timer import Timer
 from lifecycle.manifest.model import EndpointKind, Executor
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.node import configuration, services
-from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, HealthCheck, Result
+from lifecycle.node.callbacks import (
+    SUCCESS,
+    CallbackOutcome,
+    HealthCheck,
+    Result,
+    error_text,
+)
 from lifecycle.node.configuration import ConfigurationChanges, HostedState
 from lifecycle.node.data_layer import DataLayer
 from lifecycle.node.endpoint import Endpoint, Placement, interface_name, wire_name
@@ -94,6 +100,14 @@ class NodeInHost:
             return None
         self.configuration_changes.touch()
         return endpoint.placement
+
+    def note_fault(self, endpoint: Endpoint, error: Exception | None) -> str:
+        """Keep, and return, what the handler of an action raised at its last goal."""
+        fault = "" if error is None else f"its handler raised {error_text(error)}"
+        if fault != endpoint.fault:
+            endpoint.fault = fault
+            self.configuration_changes.touch()
+        return fault
 
 
 class Managed(NodeInHost):

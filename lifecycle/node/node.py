@@ -31,7 +31,7 @@ from lifecycle.node.connections import (
     connections_of,
     listen_to_connections,
 )
-from lifecycle.node.endpoint import Placement, interface_name
+from lifecycle.node.endpoint import Placement, interface_name, refuse_to_deadlock, resolve_name
 from lifecycle.node.gate import (
     DeclaredPublisher,
     Gated,
@@ -42,7 +42,6 @@ from lifecycle.node.gate import (
 )
 from lifecycle.node.handlers import ActionHandler
 from lifecycle.node.machine import NodeState
-from lifecycle.node.making import refuse_to_deadlock, resolve_name
 from lifecycle.node.managed import Managed
 from lifecycle.node.planned import (
     Construction,

@@ -15,7 +15,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -38,8 +38,6 @@ from lifecycle.plan.parameters import DEFAULT
 from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
-
     from rclpy.node import Node
 
 

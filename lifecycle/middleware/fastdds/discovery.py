@@ -161,17 +161,16 @@ def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] 
     if by_multicast:
         group = participant_ports(domain_id, 0).discovery_multicast
         targets += [Target(DISCOVERY_GROUP[kind], group, name) for name, at in here.items() if at]
-    fixed = family.option("metatraffic_port")
-    receivers = (fixed,) if fixed else _receivers(domain_id, kind)
+    if fixed := family.option("metatraffic_port"):
+        receivers = [fixed]
+    else:
+        ports = participant_ports(domain_id, 0)
+        possible = range(ports.discovery_unicast, ports.discovery_multicast + DG, 2)
+        receivers = sorted(
+            {each.port for each in open_sockets() if each.kind == kind and each.port in possible}
+        )
     addresses = tuple(each for at in here.values() for each in at)
-    return Reach(kind, tuple(targets), addresses, receivers)
-
-
-def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
-    """Return the ports of this process on which participants receive discovery, as bound."""
-    ports = participant_ports(domain_id, 0)
-    possible = range(ports.discovery_unicast, ports.discovery_multicast + DG, 2)
-    return tuple(sorted({e.port for e in open_sockets() if e.kind == kind and e.port in possible}))
+    return Reach(kind, tuple(targets), addresses, tuple(receivers))
 
 
 def _well_known(domain_id: int, address: str, participants: int) -> Iterator[Target]:
@@ -340,7 +339,11 @@ def discovery_server_command(
     ):
         current.pop(variable, None)
     current["SKIP_DEFAULT_XML"] = "1"
-    paths = [*_library_paths(), *filter(None, current.get("LD_LIBRARY_PATH", "").split(":"))]
+    # Where the wheels keep Fast DDS and what it needs.
+    data, pure = (Path(sysconfig.get_path(each)) for each in ("data", "purelib"))
+    places = (data / "lib", pure / "ros_fastrtps.libs", pure / "ros_fastdds.libs")
+    paths = [str(each) for each in places if each.is_dir()]
+    paths += filter(None, current.get("LD_LIBRARY_PATH", "").split(":"))
     current["LD_LIBRARY_PATH"] = ":".join(dict.fromkeys(paths))
     return argv, current
 
@@ -367,10 +370,3 @@ def _program() -> str:
     raise MiddlewareError(
         f"cannot find {_PROGRAM!r}", hint=f"it comes with Fast DDS; set PATH, or {INSTALL}"
     )
-
-
-def _library_paths() -> list[str]:
-    """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
-    data, pure = (Path(sysconfig.get_path(each)) for each in ("data", "purelib"))
-    places = (data / "lib", pure / "ros_fastrtps.libs", pure / "ros_fastdds.libs")
-    return [str(place) for place in places if place.is_dir()]

@@ -281,8 +281,9 @@ def has_shared_memory(node: Node) -> bool:
 
     Of one that was made otherwise than by this package it is what the process has.
     """
-    noted = _SHARED_MEMORY_OF.get(node.context)
-    return bool(own_segments()) if noted is None else noted
+    if node.context not in _SHARED_MEMORY_OF:
+        _SHARED_MEMORY_OF[node.context] = bool(own_segments())
+    return _SHARED_MEMORY_OF[node.context]
 
 
 @contextlib.contextmanager

@@ -12,9 +12,8 @@ An NFE list says which network resources an endpoint may use, not which transpor
 
 from __future__ import annotations
 
-import contextlib
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from msgspec.structs import replace
@@ -150,22 +149,38 @@ def create_subscription(
     Raises:
         MiddlewareError: not possible here; no endpoint is left.
     """
-    profile = to_rclpy(qos)
-    if unique is UniqueRequirement.STRICTLY_REQUIRED and abi.refusal():
-        hint = f"ask for optionally_required, or {INSTALL}"
-        resolved = node.resolve_topic_name(topic)
-        raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
-    if unique is UniqueRequirement.NOT_REQUIRED or abi.refusal():
+    profile, refusal = to_rclpy(qos), abi.refusal()
+    strictly = unique is UniqueRequirement.STRICTLY_REQUIRED
+    if unique is UniqueRequirement.NOT_REQUIRED or (refusal and not strictly):
         # Not by its class, which may do more with what its own code makes.
         return Node.create_subscription(node, type_, topic, callback, profile, **options)
+    validate_topic_name(topic)  # names the character at fault, which resolving does not
+    resolved = node.resolve_topic_name(topic)  # unreadable while it is made again
+    what = f"cannot create subscription {resolved!r} with network flow endpoints {unique.value}"
+    if refusal:
+        hint = f"ask for optionally_required, or {INSTALL}"
+        raise MiddlewareError(f"{what}: {refusal}", hint=hint)
     listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
     group = options.get("callback_group") or node.default_callback_group
     raw = options.get("raw", False)
     events = options.get("event_callbacks") or SubscriptionEventCallbacks()
-    with _unique_handle(node, type_, topic, profile=profile, unique=unique) as handle:
+    check_is_valid_msg_type(type_)  # also loads the type support
+    with node.handle:
+        handle = rclpy_implementation.Subscription(
+            node.handle, type_, topic, profile.get_c_qos_profile()
+        )
+    try:
+        if refusal := _made_unique(handle, node, type_, topic, unique):
+            raise MiddlewareError(  # noqa: TRY301 - after which nothing is left
+                f"{what}: {refusal}", hint=_subscription_hint()
+            )
         subscription = Subscription(
             *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
         )
+    except BaseException:
+        # A handle whose init failed is zero inside; rcl's fini accepts that.
+        handle.destroy_when_not_in_use()
+        raise
     group.add_entity(subscription)
     listed.append(subscription)  # as Node.create_subscription does
     for handler in subscription.event_handlers:
@@ -173,64 +188,6 @@ def create_subscription(
     if node.executor is not None:
         node.executor.wake()
     return subscription
-
-
-def create_publisher(
-    node: Node,
-    type_: type[Any],
-    topic: str,
-    qos: QosProfile | QoSProfile,
-    *,
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
-    **options: Any,
-) -> Publisher:
-    """Create a publisher on the node's own participant; arguments as `create_subscription`.
-
-    No RMW gives a publisher flow endpoints of its own: it becomes unique on a `FlowParticipant`.
-
-    Raises:
-        MiddlewareError: STRICTLY_REQUIRED; nothing was made.
-    """
-    if unique is UniqueRequirement.STRICTLY_REQUIRED:
-        reason = "Unique network flow endpoints not supported on publishers"
-        hint = "give the publisher its own participant, or ask for optionally_required"
-        resolved = node.resolve_topic_name(topic)
-        raise _not_feasible("publisher", resolved, unique, reason, hint)
-    return Node.create_publisher(node, type_, topic, to_rclpy(qos), **options)
-
-
-def _not_feasible(
-    kind: str, topic: str, unique: UniqueRequirement, reason: str, hint: str
-) -> MiddlewareError:
-    return MiddlewareError(
-        f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
-        hint=hint,
-    )
-
-
-@contextlib.contextmanager
-def _unique_handle(
-    node: Node, type_: type[Any], topic: str, *, profile: QoSProfile, unique: UniqueRequirement
-) -> Iterator[Any]:
-    """Yield rclpy's C++ handle, with the rcl subscription inside made again with the option."""
-    check_is_valid_msg_type(type_)  # also loads the type support
-    validate_topic_name(topic)  # names the character at fault, which resolving does not
-    resolved = node.resolve_topic_name(topic)  # for messages; unreadable while it is made again
-    with node.handle:
-        handle = rclpy_implementation.Subscription(
-            node.handle, type_, topic, profile.get_c_qos_profile()
-        )
-    try:
-        refusal = _made_unique(handle, node, type_, topic, unique)
-        if not refusal:
-            yield handle
-            return
-    except BaseException:
-        handle.destroy_when_not_in_use()
-        raise
-    # A handle whose init failed is zero inside; rcl's fini accepts that.
-    handle.destroy_when_not_in_use()
-    raise _not_feasible("subscription", resolved, unique, refusal, _subscription_hint())
 
 
 def _made_unique(

@@ -27,7 +27,7 @@ from collections.abc import Iterable, Sequence
 from lifecycle.middleware.fastdds.discovery import SETTLE_S, Reach, Target
 from lifecycle.middleware.fastdds.profiles import PARTICIPANT_LEASE_S
 from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets
-from lifecycle.middleware.process.prefixes import PROCESS_DIGITS, is_of_host
+from lifecycle.middleware.process.process_table import PROCESS_DIGITS, is_of_host
 
 ANSWER_S = 0.15
 """A participant that is asked, on this host or the next one, answers within so long."""

@@ -225,7 +225,7 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     Raises:
         ConnectionUrlError: a URL that is none.
-        MiddlewareError: URLs that one participant cannot have together, or transports beside them.
+        MiddlewareError: URLs that one participant cannot have together.
     """
 
     transports: tuple[Medium, ...] = ()
@@ -250,12 +250,6 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         )
 
     def __post_init__(self) -> None:
-        if self.urls and self.transports:
-            raise MiddlewareError(
-                f"cannot use transports {', '.join(map(repr, self.transports))} beside connection "
-                f"URL {str(self.urls[0])!r}: the URLs say which transports there are",
-                hint="leave one of them out",
-            )
         families(self.urls)
 
     @functools.cached_property

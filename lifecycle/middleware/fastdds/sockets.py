@@ -12,9 +12,7 @@ kernel puts into packets. A participant's UDP sender sockets all exist before it
 does. TCP connections are opened later, are in no NFE list, and are not marked.
 
 Fast DDS 2.14 never returns from the destruction of a participant whose TCP connection is cut, until
-its socket is shut down; and it never uses a connection whose first answer arrived before the
-connecting thread had noted what to request next: only another participant, on another port, helps
-then.
+its socket is shut down.
 """
 
 from __future__ import annotations
@@ -247,24 +245,20 @@ def _address(text: str) -> str:
 
 def _becomes_free(kind: Medium, address: str, port: int) -> bool:
     deadline = time.monotonic() + _RELEASED_S
-    while not (is_free := _is_free(kind, address, port)) and time.monotonic() < deadline:
-        time.sleep(0.001)
-    return is_free
-
-
-def _is_free(kind: Medium, address: str, port: int) -> bool:
-    with socket.socket(kind.socket_family, _TYPE[kind.is_tcp]) as probe:
-        if kind.is_tcp:  # as Fast DDS does: connections that are over are not in the way
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if kind.ip_version == 6:
-            probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        try:
-            probe.bind((address or kind.any_address, port))
-            if kind.is_tcp:
-                probe.listen()
-        except OSError:
+    while True:
+        with socket.socket(kind.socket_family, _TYPE[kind.is_tcp]) as probe:
+            if kind.is_tcp:  # as Fast DDS does: connections that are over are not in the way
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if kind.ip_version == 6:
+                probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            with contextlib.suppress(OSError):
+                probe.bind((address or kind.any_address, port))
+                if kind.is_tcp:
+                    probe.listen()
+                return True
+        if time.monotonic() >= deadline:
             return False
-    return True
+        time.sleep(0.001)
 
 
 def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
@@ -286,13 +280,6 @@ _UNANSWERED = 2
 _SYN_SENT = 2  # tcp_states.h
 _ESTABLISHED = 1
 _STATE, _RETRANSMITS, _PROBES = 0, 2, 3  # offsets in struct tcp_info
-_LAST_RECEIVED_MS, _BYTES_ACKED, _BYTES_RECEIVED = 52, 120, 128
-
-_FIRST_REQUEST = 100
-"""Bytes; the request by which Fast DDS begins has 68, and the next one 38 more."""
-
-_IDLE_MS = 500
-"""A connection in use says what it wants next within 0.1 s of the first answer."""
 
 
 def give_up_dead_connections() -> int:
@@ -313,26 +300,6 @@ def _connections() -> Iterator[socket.socket]:
     for each in sockets_here():
         if each.type == socket.SOCK_STREAM and each.family in (socket.AF_INET, socket.AF_INET6):
             yield each
-
-
-def is_used(address: str, port: int) -> bool | None:
-    """Return whether the connection that this process dialled there is used by Fast DDS.
-
-    None while that is open: there is no connection yet, or it has only just begun.
-    """
-    for each in _connections():
-        with contextlib.suppress(OSError):  # not connected yet
-            if each.getpeername() == (address, port):
-                return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
-    return None
-
-
-def _is_used(info: bytes) -> bool | None:
-    (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
-    acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
-    if acked >= _FIRST_REQUEST:
-        return True
-    return False if received and idle_ms >= _IDLE_MS else None
 
 
 def _is_dead(each: socket.socket) -> bool:

@@ -68,7 +68,6 @@ class BusySign:
         self._page = page
         self._memory = mmap.mmap(page, _PAGE_BYTES)
         self._words = memoryview(self._memory).cast("q")
-        self._of_process = False
         self._looked_at: tuple[int, Overdue | None] = (0, None)
         self._last: _Turns | None = None  # at the last look
         self._before: _Turns | None = None  # at the last look before it became busy
@@ -98,19 +97,32 @@ class BusySign:
 
     # The holder's side.
 
-    def speak_for_process(self) -> None:
-        """Be busy for all threads: what any of them waited for a processor is not its own time."""
-        self._of_process = True
-
     def show_stacks(self) -> None:
-        """Have this process show where it stands, see `where`."""
-        self._words[_ANSWERS] = _show_stacks(self._page)
+        """Have this process append its stacks to the page's file whenever `where` asks for them.
 
-    def begin(self, after_s: float = 0.0, what: str = "") -> None:
-        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before."""
+        The caller's thread, and those that begin after this, do not take the signal: what waits in
+        one of them is not interrupted. One thread has to call `show_stacks_here`.
+        """
+        signal.pthread_sigmask(signal.SIG_BLOCK, {_SIGNAL})
+        with contextlib.suppress(OSError, RuntimeError, ValueError):
+            # Of its own offset, and at the end wherever the file is cut.
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC
+            file = os.open(f"/proc/self/fd/{self._page}", flags)
+            faulthandler.register(_SIGNAL, file=file, all_threads=True)
+            self._words[_ANSWERS] = True
+
+    def begin(self, after_s: float = 0.0, what: str = "", *, for_process: bool = False) -> None:
+        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before.
+
+        Args:
+            after_s: seconds.
+            what: it does, in words.
+            for_process: be busy for all threads: what any of them waited for a processor is not
+                its own time.
+        """
         words, text = self._words, what.encode()[: _WHAT_BYTES - 1] + b"\0"
         self._memory[_WHAT : _WHAT + len(text)] = text
-        words[_THREAD] = -os.getpid() if self._of_process else threading.get_native_id()
+        words[_THREAD] = -os.getpid() if for_process else threading.get_native_id()
         words[_SINCE] = time.monotonic_ns() + round(after_s * _NS)
 
     def end(self) -> float | None:
@@ -181,8 +193,22 @@ class BusySign:
 
         Empty if it does not answer: it was stopped, or is not one of ours.
         """
-        answers = pid > 0 and self._words[_ANSWERS]
-        return _stacks_of(pid, self._page, _PAGE_BYTES) if answers else ""
+        if pid <= 0 or not self._words[_ANSWERS]:
+            return ""
+        try:
+            os.ftruncate(self._page, _PAGE_BYTES)
+            os.kill(pid, _SIGNAL)
+        except OSError:
+            return ""
+        size = _PAGE_BYTES
+        began = grown = time.monotonic()
+        while (now := time.monotonic()) - began < _WITHIN_S:
+            if (more := os.fstat(self._page).st_size) != size:
+                size, grown = more, now
+            elif size > _PAGE_BYTES and now - grown >= _STILL_S:
+                break
+            time.sleep(0.001)
+        return os.pread(self._page, _MOST_BYTES, _PAGE_BYTES).decode(errors="replace")
 
     def close(self) -> None:
         """Close this side; again is harmless."""
@@ -231,43 +257,9 @@ _STDLIB = f"{sysconfig.get_path('stdlib')}{os.sep}"
 _PACKAGES = ("site-packages", "dist-packages")
 
 
-def _show_stacks(descriptor: int) -> bool:
-    """Have this process append its stacks to a file whenever it is asked; whether that works.
-
-    The caller's thread, and those that begin after this, do not take the signal: what waits in one
-    of them is not interrupted. One thread has to call `show_stacks_here`.
-    """
-    signal.pthread_sigmask(signal.SIG_BLOCK, {_SIGNAL})
-    try:
-        # Of its own offset, and at the end wherever the file is cut.
-        file = os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
-        faulthandler.register(_SIGNAL, file=file, all_threads=True)
-    except (OSError, RuntimeError, ValueError):
-        return False
-    return True
-
-
 def show_stacks_here() -> None:
     """Take the signal in this thread; it must not mind being interrupted."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {_SIGNAL})
-
-
-def _stacks_of(pid: int, descriptor: int, keep_bytes: int) -> str:
-    """Return the stacks of a process that answers into a file, behind what it keeps there."""
-    try:
-        os.ftruncate(descriptor, keep_bytes)
-        os.kill(pid, _SIGNAL)
-    except OSError:
-        return ""
-    began = grown = time.monotonic()
-    size = keep_bytes
-    while (now := time.monotonic()) - began < _WITHIN_S:
-        if (more := os.fstat(descriptor).st_size) != size:
-            size, grown = more, now
-        elif size > keep_bytes and now - grown >= _STILL_S:
-            break
-        time.sleep(0.001)
-    return os.pread(descriptor, _MOST_BYTES, keep_bytes).decode(errors="replace")
 
 
 def brief(stacks: str) -> str:

@@ -103,8 +103,11 @@ def check_memory() -> None:
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     is_limited = soft != resource.RLIM_INFINITY
-    if not (is_limited and soft < _LEAST_ADDRESSES_KIB * 1024) and _may_map(_ADDRESS_BYTES):
-        return
+    if not (is_limited and soft < _LEAST_ADDRESSES_KIB * 1024):
+        with contextlib.suppress(OSError):
+            flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+            mmap.mmap(-1, _ADDRESS_BYTES, flags=flags, prot=0).close()
+            return
     used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     needed = max(_LEAST_ADDRESSES_KIB, (used * mmap.PAGESIZE + _ADDRESS_BYTES) // 1024)
     has = f"{soft // 1024} KiB" if is_limited else "so little memory"
@@ -112,14 +115,6 @@ def check_memory() -> None:
         f"cannot run with {has}: it takes {needed} KiB of addresses (RLIMIT_AS)",
         hint=f"raise it (ulimit -v {needed}, LimitAS=)",
     )
-
-
-def _may_map(size: int) -> bool:
-    try:
-        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
-    except OSError:
-        return False
-    return True
 
 
 def no_room_for_threads(count: int) -> MiddlewareError:

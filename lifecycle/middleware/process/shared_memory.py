@@ -103,36 +103,37 @@ def leftovers() -> tuple[str, ...]:
 def _unused(*, remove: bool) -> tuple[tuple[str, ...], bool]:
     """Return the names of unused files, and whether others use some that no process owns."""
     groups: dict[str, dict[Path, os.stat_result]] = {}
-    for path in _files():
+    for path in _DIRECTORY.iterdir() if _DIRECTORY.is_dir() else ():
         if group := _group(path.name):
             with contextlib.suppress(FileNotFoundError):
                 groups.setdefault(group, {})[path] = path.lstat()
     in_use = False
     unowned: dict[str, dict[Path, os.stat_result]] = {}
     for group, files in groups.items():
-        if not all(_is_own(each) for each in files.values()):
+        if not all(
+            stat.S_ISREG(each.st_mode) and each.st_uid == os.getuid() for each in files.values()
+        ):
             continue
-        if remove and any(_is_new(each) for each in files.values()):
+        # One that is new may not be locked yet by who made it.
+        if remove and any(0 <= time.time() - each.st_ctime < _NEW_S for each in files.values()):
             in_use = True
-        else:
-            # One that is locked is owned by a process.
-            with contextlib.suppress(OSError), _locked(files):
-                unowned[group] = files
+            continue
+        with contextlib.suppress(OSError), _locked(files):  # else a process owns it
+            unowned[group] = files
     # Reading what all processes map takes milliseconds, in which a participant that is made would
     # be refused its port for a lock of ours: none is held meanwhile.
     shared = {name for name, files in unowned.items() if "_port" in name or not _locks(files)}
-    in_others = shared & _mapped_by_any() if shared else set()
-    in_use = in_use or bool(in_others)
+    processes = filter(str.isdigit, os.listdir("/proc")) if shared else ()  # noqa: PTH208 - names
+    in_others = shared & set().union(*map(_mapped, processes))
     found: list[str] = []
-    for group, files in unowned.items():
-        if group in in_others:
-            continue
+    for group in unowned.keys() - in_others:
+        files = unowned[group]
         with contextlib.suppress(OSError), _locked(files) if remove else contextlib.nullcontext():
             for path in files:
                 if remove:
                     path.unlink(missing_ok=True)
                 found.append(path.name)
-    return tuple(sorted(found)), in_use
+    return tuple(sorted(found)), in_use or bool(in_others)
 
 
 def _locks(files: Iterable[Path]) -> list[Path]:
@@ -141,28 +142,14 @@ def _locks(files: Iterable[Path]) -> list[Path]:
 
 @contextlib.contextmanager
 def _locked(files: Iterable[Path]) -> Iterator[None]:
-    """Hold the locks of a group; raises OSError where a process has one."""
-    with contextlib.ExitStack() as locks:
+    """Hold the locks of a group; raises OSError where a process has one, or one is no file."""
+    with contextlib.ExitStack() as held:
         for each in _locks(files):
-            locks.enter_context(_lock(each))
+            flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+            descriptor = os.open(each, flags)
+            held.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
-
-
-def _mapped_by_any() -> set[str]:
-    """Return the groups of which any process has a file mapped."""
-    processes = filter(str.isdigit, os.listdir("/proc"))  # noqa: PTH208 - names
-    return set().union(*map(_mapped, processes))
-
-
-@contextlib.contextmanager
-def _lock(path: Path) -> Iterator[None]:
-    """Hold a lock file; raises OSError where another process has it, or it is no file."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _mapped(process: str) -> frozenset[str]:
@@ -173,21 +160,6 @@ def _mapped(process: str) -> frozenset[str]:
             if own in line:
                 found.add(_group(line.rpartition("/")[2]))
     return frozenset(found - {""})
-
-
-def _files() -> list[Path]:
-    with contextlib.suppress(FileNotFoundError):
-        return list(_DIRECTORY.iterdir())
-    return []
-
-
-def _is_own(status: os.stat_result) -> bool:
-    return stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid()
-
-
-def _is_new(status: os.stat_result) -> bool:
-    """Whether a process may have made it, and not yet locked it."""
-    return 0 <= time.time() - status.st_ctime < _NEW_S
 
 
 def _group(name: str) -> str:

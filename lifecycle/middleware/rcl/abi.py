@@ -277,12 +277,8 @@ def _loaded() -> Rcl | MiddlewareError:
 
 def assert_liveliness(publisher: int) -> bool:
     """Assert the liveliness of an rcl_publisher_t without the GIL; return whether it was."""
-    return bool(_asserting()(publisher) == RCL_RET_OK)
-
-
-@functools.lru_cache(maxsize=1)
-def _asserting() -> Any:
-    return bind("rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,))
+    call = bind("rcl_publisher_assert_liveliness", _CODE, (_POINTER,))
+    return bool(call(publisher) == RCL_RET_OK)
 
 
 def type_support(message_type: object) -> int:
@@ -295,7 +291,8 @@ def type_support(message_type: object) -> int:
     return int(pointer(capsule, name(capsule)))
 
 
-def bind(symbol: str, result: Any, arguments: Sequence[Any]) -> Any:
+@functools.cache
+def bind(symbol: str, result: Any, arguments: tuple[Any, ...]) -> Any:
     """Return a function of the library that its name begins with: rcl, rmw or rcutils.
 
     Raises:
@@ -317,7 +314,7 @@ def bind(symbol: str, result: Any, arguments: Sequence[Any]) -> Any:
             f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'})",
             hint=INSTALL,
         ) from error
-    function.restype, function.argtypes = result, tuple(arguments)
+    function.restype, function.argtypes = result, arguments
     return function
 
 

@@ -25,35 +25,36 @@ from rclpy.subscription import Subscription
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import is_served, reach, settle_s
 from lifecycle.middleware.fastdds.factory import observer_settings
+from lifecycle.middleware.fastdds.participant import quiet_node
 from lifecycle.middleware.fastdds.prober import Settling
 from lifecycle.middleware.fastdds.profiles import (
     DISCOVERY_SERVER_VARIABLE,
     FORGOTTEN_S,
     ParticipantSettings,
 )
-from lifecycle.middleware.fastdds.sockets import give_up_dead_connections, is_used
-from lifecycle.middleware.process.prefixes import (
+from lifecycle.middleware.fastdds.sockets import give_up_dead_connections
+from lifecycle.middleware.process.process_table import (
     PROCESS_DIGITS,
     is_of_host,
     is_of_process,
     is_vouched_for,
 )
-from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.graph_queries import (
     OF_SERVICES,
     OVER_DDS,
     RAW,
+    GraphGuard,
     endpoints_in,
     endpoints_of,
     endpoints_of_node,
     nameless_repliers,
+    prefix_of,
     rmw_topics,
     services_of_node,
     topic_names,
     unreadable,
     with_reply,
 )
-from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import (
@@ -71,12 +72,8 @@ if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
 _PARAMETER_EVENTS = "/parameter_events"
 """rclcpp and rclpy give every node one publisher of it."""
 
-_AGREED_S = 5.0
-"""A server that listens agrees within so long, on a busy machine too."""
-
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
-_LOOK_S = 0.005
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
 
@@ -128,7 +125,7 @@ class GraphObserver:
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
         self._clock: Subscription[Any] | None = None
-        self._time_came = self._clock_closed = False
+        self._time_came = False
         self._context: rclpy.Context | None = None
         if node is None:
             name = f"_lifecycle_observer_{os.getpid()}"
@@ -147,7 +144,6 @@ class GraphObserver:
         self._departed_s: dict[ObservedEndpoint, float] = {}  # when each was last shown
         self._dead: frozenset[str] = frozenset()
         self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
-        self._own = ""  # the observer's GUID prefix, once a process has ended
         self._topics_before: frozenset[str] = frozenset()
 
     @classmethod
@@ -213,7 +209,7 @@ class GraphObserver:
         for name in () if OVER_DDS else homes:
             shown.setdefault(name, []).extend(services_of_node(self.node, name))
         named = frozenset(itertools.chain.from_iterable(homes.values()))
-        self.settling.saw(named, next(iter(homes.get(self._name, ())), ""))
+        self.settling.saw(named, self.prefix)
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
         if self.owns_node and counts.get(self._name) == 1:
@@ -271,14 +267,14 @@ class GraphObserver:
     @property
     def prefix(self) -> str:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
-        return self._homes()[1]
+        return prefix_of(self.node)
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Return which of the nodes of this machine are in hosts of ours, see `prefixes`."""
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         found = {}
         for name in nodes:
-            here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
+            here = [each for each in homes.get(name, ()) if is_of_host(each, own)]
             if here:
                 found[name] = all(map(is_vouched_for, here))
         return found
@@ -295,27 +291,6 @@ class GraphObserver:
         listed = endpoints_of_node(self.node, EndpointKind.SERVICE_SERVER, node)
         return frozenset(name for name, _ in listed or ())
 
-    def reaches_servers(self) -> bool:
-        """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.
-
-        What Fast DDS has not agreed on with a server by then it never will: only another observer
-        may. Without such servers there is nothing to wait for.
-        """
-        deadline = time.monotonic() + _AGREED_S
-        servers = [
-            (server.address, server.port)
-            for url in self.urls
-            if url.transport.is_tcp
-            for server in url.server
-            if server.port is not None
-        ]
-        for address, port in servers:
-            while not (used := is_used(address, port)):
-                if used is False or time.monotonic() > deadline:
-                    return False
-                time.sleep(_LOOK_S)  # the kernel gives no event
-        return True
-
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         """Count the participants of a process no more, although discovery shows them still.
 
@@ -327,21 +302,21 @@ class GraphObserver:
         """
         if self._destroyed:
             return
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        theirs = (each for each in claimed if own and is_of_process(each, pid, own))
+        theirs = (each for each in claimed if is_of_process(each, pid, own))
         now_s = time.monotonic()
         lately = {each: at for each, at in self._ended_until_s.items() if at > now_s}
-        self._ended_until_s, self._own = {**lately, pid: now_s + FORGOTTEN_S}, own
-        self._count_no_more(theirs, own)
+        self._ended_until_s = {**lately, pid: now_s + FORGOTTEN_S}
+        self._count_no_more(theirs)
         self._guard.notify()  # what it had made may be without a name yet
 
     def ended_participant(self, prefix: str) -> None:
         """Count participants of an ended process no more, by the GUID prefix of one of them."""
-        self._count_no_more((prefix,), self.prefix)
+        self._count_no_more((prefix,))
 
-    def _count_no_more(self, prefixes: Iterable[str], own: str) -> None:
-        ended = {each[:PROCESS_DIGITS] for each in prefixes} - {own[:PROCESS_DIGITS]}
+    def _count_no_more(self, prefixes: Iterable[str]) -> None:
+        ended = {each[:PROCESS_DIGITS] for each in prefixes} - {self.prefix[:PROCESS_DIGITS]}
         if not ended <= self._dead:
             self._dead |= ended
             self._guard.notify()
@@ -349,22 +324,22 @@ class GraphObserver:
     def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
         if endpoint.gid[:PROCESS_DIGITS] in self._dead:
             return True
-        if endpoint.node or not self._own:
+        if endpoint.node or not self._ended_until_s:
             return False
         # A process that was killed before the name of its node was known has reported nothing.
         now_s, prefix = time.monotonic(), endpoint.gid[:PREFIX_DIGITS]
         return any(
-            now_s < until_s and is_of_process(prefix, pid, self._own)
+            now_s < until_s and is_of_process(prefix, pid, self.prefix)
             for pid, until_s in self._ended_until_s.items()
         )
 
-    def _homes(self) -> tuple[dict[str, set[str]], str]:
-        """Return by full name the prefixes of the participants that nodes are on, and our own."""
+    def _homes(self) -> dict[str, set[str]]:
+        """Return by full name the prefixes of the participants that nodes are on."""
         homes: dict[str, set[str]] = {}
         for each in endpoints_of(self.node, EndpointKind.PUBLISHER, _PARAMETER_EVENTS):
             if each.node and not self._is_dead(each):
                 homes.setdefault(each.node, set()).add(each.gid[:PREFIX_DIGITS])
-        return homes, next(iter(homes.get(self._name, ())), "")
+        return homes
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started, by node and GUID prefix.
@@ -373,7 +348,7 @@ class GraphObserver:
         """
         from lifecycle.middleware.process.process_table import programs_of
 
-        homes, own = self._homes()
+        homes, own = self._homes(), self.prefix
         if not own:
             return {}
         known = programs_of((each for home in homes.values() for each in home), own, environment)
@@ -409,13 +384,11 @@ class GraphObserver:
             self._clock = self.node.create_subscription(
                 Clock, CLOCK[0], self._take_time, qos_profile_sensor_data
             )
-        elif self._time_came and not self._clock_closed:
-            self._clock_closed = True
-            self.node.destroy_subscription(self._clock)
 
     def _take_time(self, _: object) -> None:
         if not self._time_came:
             self._time_came = True
+            self.node.destroy_subscription(self._clock)
             self._guard.notify()
 
     def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:

@@ -1,10 +1,9 @@
-"""Nodes of rclpy's own classes: construction, endpoints, state machine, executor.
+"""Nodes of rclpy's own classes: what their endpoints are, state machine, executor.
 
-Owns: wrappers of public methods of rclpy.node.Node, by which a process that hosts nodes gives them
-their planned names and knows each endpoint that they make; and the state machine of
-rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what its callbacks raise, and an
-invalid request by service ends the process (rclpy/lifecycle/node.py). Of rclpy it takes private
-names as Jazzy and Kilted have them, and refuses to drive a node that has others.
+Owns: the state machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what
+its callbacks raise, and an invalid request by service ends the process (rclpy/lifecycle/node.py).
+Of rclpy it takes private names as Jazzy and Kilted have them, and refuses to drive a node that has
+others.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ import contextlib
 import functools
 import inspect
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Collection, Iterator
+from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from rclpy.exceptions import InvalidHandle
@@ -32,129 +31,22 @@ from lifecycle.middleware.versions import private
 
 RCLError = _rclpy.RCLError
 
-_FACTORIES = (
-    ("create_publisher", EndpointKind.PUBLISHER),
-    ("create_subscription", EndpointKind.SUBSCRIPTION),
-    ("create_service", EndpointKind.SERVICE_SERVER),
-    ("create_client", EndpointKind.SERVICE_CLIENT),
-)
-_POSITIONAL = {
-    EndpointKind.PUBLISHER: ("msg_type", "topic", "qos_profile"),
-    EndpointKind.SUBSCRIPTION: ("msg_type", "topic", "callback", "qos_profile"),
-}
-_REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
 _ACTIONS = {
     ("rclpy.action.server", "ActionServer"): EndpointKind.ACTION_SERVER,
     ("rclpy.action.client", "ActionClient"): EndpointKind.ACTION_CLIENT,
 }
 
 
-class NodeHooks(Protocol):
-    """What is notified of what a node makes."""
+def noted_action(node: Node, waitable: Any) -> EndpointKind | None:
+    """Return which end of an action one of rclpy's constructors has just added; None for others.
 
-    def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
-        """Make a publisher or subscription that a factory was asked for; None has rclpy make it."""
-
-    def made(self, kind: EndpointKind, entity: Any) -> None:
-        """One of its factories, or an action's constructor, is about to return."""
-
-    def removed(self, entity: Any) -> None:
-        """An entity is about to be destroyed."""
-
-    def close(self) -> None:
-        """The node is about to be destroyed."""
-
-
-Constructing = Callable[
-    [Node, str, dict[str, Any]], contextlib.AbstractContextManager[tuple[str, dict[str, Any]]]
-]
-"""Wraps rclpy's constructor; yields the name and keywords to construct with."""
-HooksOf = Callable[[Node], "NodeHooks | None"]
-
-
-def follow_nodes(constructing: Constructing, hooks_of: HooksOf) -> Callable[[], None]:
-    """Follow every node of this process from now on, whatever class it is of.
-
-    Args:
-        constructing: is entered while rclpy constructs a node.
-        hooks_of: returns what is notified of a node; None for nothing.
-
-    Returns:
-        What ends that.
+    Its `action_name` is fully qualified then.
     """
-    initialise, destroy = Node.__init__, Node.destroy_node
-
-    @functools.wraps(initialise)
-    def construct(self: Node, node_name: str, **options: Any) -> None:
-        with constructing(self, node_name, options) as (name, changed):
-            initialise(self, name, **changed)
-
-    @functools.wraps(destroy)
-    def destroy_node(self: Node) -> None:
-        if (hooks := hooks_of(self)) is not None:
-            hooks.close()
-        destroy(self)
-
-    wrapped: dict[str, Callable[..., Any]] = {
-        "__init__": construct,
-        "destroy_node": destroy_node,
-        "add_waitable": _noting_actions(Node.add_waitable, hooks_of),
-    }
-    wrapped |= {name: _noting(getattr(Node, name), kind, hooks_of) for name, kind in _FACTORIES}
-    wrapped |= {name: _forgetting(getattr(Node, name), hooks_of) for name in _REMOVERS}
-    before = {name: getattr(Node, name) for name in wrapped}
-
-    def put(methods: Mapping[str, Callable[..., Any]]) -> None:
-        for name, method in methods.items():
-            setattr(Node, name, method)
-
-    put(wrapped)
-    return functools.partial(put, before)
-
-
-def _noting(make: Callable[..., Any], kind: EndpointKind, hooks_of: HooksOf) -> Callable[..., Any]:
-    names = _POSITIONAL.get(kind)
-
-    @functools.wraps(make)
-    def create(self: Node, *arguments: Any, **options: Any) -> Any:
-        hooks = hooks_of(self)
-        if hooks is None:
-            return make(self, *arguments, **options)
-        entity = None
-        if names is not None:
-            given = {**dict(zip(names, arguments, strict=False)), **options}
-            entity = hooks.make(kind, given)
-        if entity is None:
-            entity = make(self, *arguments, **options)
-        hooks.made(kind, entity)
-        return entity
-
-    return create
-
-
-def _forgetting(destroy: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:
-    @functools.wraps(destroy)
-    def remove(self: Node, entity: Any) -> Any:
-        if (hooks := hooks_of(self)) is not None:
-            hooks.removed(entity)
-        return destroy(self, entity)
-
-    return remove
-
-
-def _noting_actions(add: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:
-    @functools.wraps(add)
-    def add_waitable(self: Node, waitable: Any) -> None:
-        add(self, waitable)
-        names = ((each.__module__, each.__name__) for each in type(waitable).__mro__)
-        kind = next((_ACTIONS[each] for each in names if each in _ACTIONS), None)
-        if kind is None:
-            return
-        waitable.action_name = _action_name(self, kind, waitable)
-        if (hooks := hooks_of(self)) is not None:
-            hooks.made(kind, waitable)
-
-    return add_waitable
+    names = ((each.__module__, each.__name__) for each in type(waitable).__mro__)
+    kind = next((_ACTIONS[each] for each in names if each in _ACTIONS), None)
+    if kind is not None:
+        waitable.action_name = _action_name(node, kind, waitable)
+    return kind
 
 
 def _action_name(node: Node, kind: EndpointKind, action: Any) -> str:
@@ -175,7 +67,7 @@ def _action_name(node: Node, kind: EndpointKind, action: Any) -> str:
     return next(iter(new or listed), "")  # a second client of a name brings none
 
 
-def follow_goals(server: Any, ended: Callable[[Exception | None], None]) -> None:
+def follow_goals(server: Any, ended: Callable[[Exception | None], object]) -> None:
     """Call back at the end of each goal with what the handler of an action server raised, or None.
 
     Where rclpy keeps the handler otherwise than is known, nothing is called.

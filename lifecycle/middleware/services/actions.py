@@ -19,12 +19,10 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.versions import private
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
-    from rclpy.guard_condition import GuardCondition
     from rclpy.node import Node
 
 
@@ -58,19 +56,14 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         refuse_to_block: Callable[[str, str], None],
     ) -> None:
         self._refuse_to_block = refuse_to_block
-        self._participant = node  # `_node` becomes whose executor it is, on a connection another
-        self._group = group
         self._goal_type = action_type.Goal
         self._what = f"action {name!r}"
         self._awaited: dict[Future, str] = {}  # what each says
-        self._lock = threading.Lock()  # of the next four
+        self._lock = threading.Lock()  # of the next two
         self._held: list[Callable[[], None]] = []
-        self._watch: ServerWatch | None = None
-        self._matched: GuardCondition | None = None
         self._destroyed = False
         self.action_name = ""
         super().__init__(node, action_type, name, callback_group=group)
-        private(self, "_node", f"make action client {name!r}")
 
     def send_goal(self, goal: Any, **options: Any) -> Any:
         """As rclpy's, outside of callbacks: it waits for the result."""
@@ -78,7 +71,10 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         return _wait(_wait(self.send_goal_async(goal, **options)).get_result_async())
 
     def send_goal_async(self, goal: Any, *arguments: Any, **options: Any) -> Future:
-        """As rclpy's; a goal is held until a server is matched, before which DDS would lose it."""
+        """As rclpy's; a goal is held until a server is matched, before which DDS would lose it.
+
+        Whoever made this calls `send_held` when one may be.
+        """
         if not isinstance(goal, self._goal_type):
             raise TypeError(f"{goal!r} is no goal of {self._what}")
         promised = self._await(Future(), "whether a goal is accepted")
@@ -89,12 +85,10 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
 
         if self.server_is_ready():
             send()
-            return promised
-        with self._lock:
-            self._held.append(send)
-            if self._watch is None:
-                self._matched = self._node.create_guard_condition(self._send_held, self._group)
-                self._watch = ServerWatch(self._participant, self, self._matched.trigger)
+        else:
+            with self._lock:
+                self._held.append(send)
+            self.send_held()  # one may have been matched meanwhile
         return promised
 
     def destroy(self) -> None:
@@ -103,7 +97,6 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
             if self._destroyed:
                 return
             self._destroyed = True
-            self._let_go()
         for future, what in tuple(self._awaited.items()):
             if not future.done():
                 future.set_exception(
@@ -113,25 +106,14 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
                 )
         super().destroy()
 
-    def _send_held(self) -> None:
+    def send_held(self) -> None:
         """Send what was held, if a server is matched now; in the executor."""
         with self._lock:
             if self._destroyed or not self.server_is_ready():
                 return
-            held = self._let_go()
+            held, self._held = self._held, []
         for send in held:
             send()
-
-    def _let_go(self) -> list[Callable[[], None]]:
-        """Hold nothing any more, with the lock taken; return what was held."""
-        held, self._held = self._held, []
-        if self._watch is not None:
-            self._watch.stop()
-            self._watch = None
-        if self._matched is not None:
-            self._node.destroy_guard_condition(self._matched)
-            self._matched = None
-        return held
 
     def _await(self, future: Future, what: str) -> Future:
         """Have an answer end with this client at the latest."""

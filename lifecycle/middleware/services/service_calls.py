@@ -95,13 +95,13 @@ class ServiceCalls:
             if before is not None:
                 await before()
             attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
-            answer = await _ask(client, type_.Request(**fields), deadline, attempt_s)
+            answered = await _ask(client, type_.Request(**fields), deadline, attempt_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
-        if answer is None:
+        if answered is None:
             raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
-        return answer
+        return answered.result()
 
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""
@@ -136,16 +136,8 @@ class ServiceCalls:
         """Return a client matched with all servers, or long enough with some; None if none came."""
         loop = asyncio.get_running_loop()
         offered_s: float | None = None
-        client = self._client(service, type_)
-        while True:
-            try:
-                if client.service_is_ready():
-                    return client
-            except InvalidHandle:
-                if self._destroyed:
-                    raise
-                client = self._client(service, type_)
-                continue
+        # Made anew where the node has left, and comes again, meanwhile.
+        while not (client := self._client(service, type_)).service_is_ready():
             now_s = loop.time()
             if not self._observer.node.count_services(service):
                 offered_s = None
@@ -153,42 +145,34 @@ class ServiceCalls:
                 offered_s = now_s
             is_late = now_s >= deadline
             if offered_s is not None and (is_late or now_s - offered_s >= _UNMATCHED_S):
-                return client
-            if is_late:
+                break
+            if is_late or self._destroyed:
                 return None
             await asyncio.sleep(min(_MATCH_CHECK_S, deadline - now_s))
+        return client
 
 
-async def _ask(client: Client, request: object, deadline: float, attempt_s: float) -> Any:
+async def _ask(client: Client, request: object, deadline: float, attempt_s: float) -> Future | None:
     """Send a request, again after each attempt, ever longer; None if no answer came in time."""
     loop = asyncio.get_running_loop()
-    answer: asyncio.Future[Any] = loop.create_future()
+    answered = asyncio.Event()
+    waiting = asyncio.ensure_future(answered.wait())
     sent: list[Future] = []
+
+    def notify(_: Future) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            loop.call_soon_threadsafe(answered.set)
+
     try:
         while (left_s := deadline - loop.time()) > 0:
             sent.append(client.call_async(request))
-            sent[-1].add_done_callback(lambda done: _post(loop, lambda: _deliver(answer, done)))
-            await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
-            if answer.done():
-                return answer.result()
+            sent[-1].add_done_callback(notify)
+            await asyncio.wait((waiting,), timeout=min(attempt_s, left_s))
+            if answered.is_set():
+                return next(each for each in sent if each.done())
             attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
         return None
     finally:
+        waiting.cancel()
         for pending in sent:
             client.remove_pending_request(pending)
-        answer.cancel()
-
-
-def _post(loop: asyncio.AbstractEventLoop, work: Callable[[], object]) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-        loop.call_soon_threadsafe(work)
-
-
-def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:
-    if answer.done() or pending.cancelled():
-        return
-    error = pending.exception()
-    if error is not None:
-        answer.set_exception(error)
-    else:
-        answer.set_result(pending.result())

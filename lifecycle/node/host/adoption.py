@@ -1,8 +1,13 @@
-"""Make the nodes of the user's classes and functions, each as one planned node."""
+"""Make the nodes of the user's classes and functions, each as one planned node.
+
+Owns: wrappers of public methods of rclpy.node.Node, by which a process that hosts nodes gives them
+their planned names and knows each endpoint that those of rclpy's own classes make.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -13,13 +18,14 @@ from rclpy.node import Node
 from rclpy.utilities import get_default_context
 
 from lifecycle.errors import BringUpError, LifecycleError
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import reach
 from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.participant import made_participant
 from lifecycle.middleware.fastdds.prober import Prober
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.graph_queries import OVER_DDS
-from lifecycle.middleware.rcl.hidden_node import made_participant
-from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
+from lifecycle.middleware.rcl.rclpy_nodes import is_rclpy_managed, noted_action
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.managed import Managed
 from lifecycle.node.node import LifecycleNode
@@ -31,6 +37,18 @@ if TYPE_CHECKING:
 
 Hosted = Managed | ForeignNode
 """What a host knows of one of its nodes."""
+
+_FACTORIES = {
+    "create_publisher": (EndpointKind.PUBLISHER, ("msg_type", "topic", "qos_profile")),
+    "create_subscription": (
+        EndpointKind.SUBSCRIPTION,
+        ("msg_type", "topic", "callback", "qos_profile"),
+    ),
+    "create_service": (EndpointKind.SERVICE_SERVER, ()),
+    "create_client": (EndpointKind.SERVICE_CLIENT, ()),
+}
+"""What each makes, and its positional parameters where it can be made with a flow of its own."""
+_REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
 
 
 def initialised(
@@ -97,7 +115,6 @@ class Adoption:
     Attributes:
         participants: of the process.
         made: what stands for each node, by its key in the plan.
-        unfollow: ends that nodes of this process are taken for those of the plan.
     """
 
     def __init__(
@@ -118,7 +135,94 @@ class Adoption:
         self._constructed: dict[str, Node] = {}
         self._foreign: dict[int, ForeignNode] = {}
         self.made: dict[str, Hosted] = {}
-        self.unfollow = follow_nodes(self.constructing, lambda node: self._foreign.get(id(node)))
+        self._before: dict[str, Callable[..., Any]] = {}
+        self._wrap("__init__", self._initialise)
+        self._wrap("destroy_node", self._destroy)
+        self._wrap("add_waitable", self._add_waitable)
+        for name, (kind, names) in _FACTORIES.items():
+            self._wrap(name, functools.partial(self._create, kind, names))
+        for name in _REMOVERS:
+            self._wrap(name, self._remove)
+
+    def unfollow(self) -> None:
+        """Take no node that is made from now on for one of the plan."""
+        for name, method in self._before.items():
+            setattr(Node, name, method)
+
+    def _wrap(self, name: str, around: Callable[..., Any]) -> None:
+        """Have a method of all nodes, whatever class they are of, called by `around`."""
+        method = self._before[name] = getattr(Node, name)
+
+        @functools.wraps(method)
+        def wrapped(node: Node, *arguments: Any, **options: Any) -> Any:
+            return around(method, node, *arguments, **options)
+
+        setattr(Node, name, wrapped)
+
+    def _initialise(
+        self, initialise: Callable[..., None], node: Node, node_name: str, **options: Any
+    ) -> None:
+        """Have rclpy construct a node as planned; one that is not planned is not touched."""
+        planned = self._take(node_name, options.get("namespace"))
+        ours = isinstance(node, LifecycleNode)
+        if planned is None:
+            if ours and self._unplanned is not None:
+                node._construction, self._unplanned = self._unplanned, None  # noqa: SLF001
+                options["use_global_arguments"] = self._use_global_arguments
+            initialise(node, node_name, **options)
+            return
+        refuse_unmanaged(planned, type(node))
+        options = planned_options(node, planned, options)
+        options["namespace"] = planned.namespace
+        options["use_global_arguments"] = self._use_global_arguments
+        if ours:
+            # Of a plain node no states are driven.
+            supervisor = self._supervisor if planned.managed else ""
+            node._construction = Construction(  # noqa: SLF001 - it is for us
+                spec=planned, supervisor=supervisor
+            )
+        with self.participants.carrying(ParticipantSettings.of(planned)) as context:
+            initialise(node, planned.name, **{**options, "context": context})
+        if not (ours and planned.managed):
+            self._foreign[id(node)] = ForeignNode(
+                node, planned, supervisor=self._supervisor, loop=self._loop
+            )
+        self._constructed[planned.key] = node
+
+    def _destroy(self, destroy: Callable[[Node], None], node: Node) -> None:
+        if (foreign := self._foreign.get(id(node))) is not None:
+            foreign.close()
+        destroy(node)
+
+    def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
+        add(node, waitable)
+        kind, foreign = noted_action(node, waitable), self._foreign.get(id(node))
+        if kind is not None and foreign is not None:
+            foreign.made(kind, waitable)
+
+    def _create(
+        self,
+        kind: EndpointKind,
+        names: Sequence[str],
+        make: Callable[..., Any],
+        node: Node,
+        *arguments: Any,
+        **options: Any,
+    ) -> Any:
+        foreign = self._foreign.get(id(node))
+        if foreign is None:
+            return make(node, *arguments, **options)
+        given = {**dict(zip(names, arguments, strict=False)), **options}
+        entity = foreign.make(kind, given) if names else None
+        if entity is None:
+            entity = make(node, *arguments, **options)
+            foreign.made(kind, entity)
+        return entity
+
+    def _remove(self, destroy: Callable[..., Any], node: Node, entity: Any) -> Any:
+        if (foreign := self._foreign.get(id(node))) is not None:
+            foreign.removed(entity)
+        return destroy(node, entity)
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
@@ -184,37 +288,6 @@ class Adoption:
                 f"cannot use {reference!r}: it returns {returned!r} and must return its nodes",
                 hint="it must neither spin nor destroy them: the host does",
             )
-
-    @contextlib.contextmanager
-    def constructing(
-        self, node: Node, name: str, options: dict[str, Any]
-    ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Have rclpy construct a node as planned; one that is not planned is not touched."""
-        planned = self._take(name, options.get("namespace"))
-        ours = isinstance(node, LifecycleNode)
-        if planned is None:
-            if ours and self._unplanned is not None:
-                node._construction, self._unplanned = self._unplanned, None  # noqa: SLF001
-                options["use_global_arguments"] = self._use_global_arguments
-            yield name, options
-            return
-        refuse_unmanaged(planned, type(node))
-        options = planned_options(node, planned, options)
-        options["namespace"] = planned.namespace
-        options["use_global_arguments"] = self._use_global_arguments
-        if ours:
-            # Of a plain node no states are driven.
-            supervisor = self._supervisor if planned.managed else ""
-            node._construction = Construction(  # noqa: SLF001 - it is for us
-                spec=planned, supervisor=supervisor
-            )
-        with self.participants.carrying(ParticipantSettings.of(planned)) as context:
-            yield planned.name, {**options, "context": context}
-        if not (ours and planned.managed):
-            self._foreign[id(node)] = ForeignNode(
-                node, planned, supervisor=self._supervisor, loop=self._loop
-            )
-        self._constructed[planned.key] = node
 
     def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
         """Choose whose construction this is: by name among the group, else the one asked for."""

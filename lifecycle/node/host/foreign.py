@@ -23,7 +23,7 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
@@ -32,13 +32,12 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
-from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result, error_text
+from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
 from lifecycle.node.configuration import HostedState
 from lifecycle.node.connections import Connection, Connections
-from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, watch_matches
+from lifecycle.node.endpoint import CLIENTS, Endpoint, Placement, factory, watch_matches
 from lifecycle.node.gate import GatedSubscription, HeldPublisher
 from lifecycle.node.machine import RefusedError
-from lifecycle.node.making import factory
 from lifecycle.node.managed import NodeInHost
 from lifecycle.node.services import serve_interface
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -80,7 +79,6 @@ class ForeignNode(NodeInHost):
         self._group = ReentrantCallbackGroup()
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self.connections = Connections(node, spec.participants)
-        self._apart: dict[int, Connection] = {}  # by id of what is being made on others
         self._is_spun = False
         self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
@@ -115,7 +113,7 @@ class ForeignNode(NodeInHost):
 
     # What its class makes.
 
-    def made(self, kind: EndpointKind, entity: Any) -> None:
+    def made(self, kind: EndpointKind, entity: Any, connection: Connection | None = None) -> None:
         """Note an endpoint, hold it if it publishes, and watch who is matched with it."""
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
@@ -129,18 +127,12 @@ class ForeignNode(NodeInHost):
             unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
             unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
-        connection = self._apart.pop(id(entity), self.connections.own)
-        placement = Placement(connection=connection, entity=entity, unwatch=unwatch)
+        placement = Placement(
+            connection=connection or self.connections.own, entity=entity, unwatch=unwatch
+        )
         endpoint = self.add(kind, placement)
         if kind is EndpointKind.ACTION_SERVER:
-            follow_goals(entity, functools.partial(self._goal_ended, endpoint))
-
-    def _goal_ended(self, endpoint: Endpoint, error: Exception | None) -> None:
-        """Keep what the handler of an action raised at its last goal."""
-        fault = "" if error is None else f"its handler raised {error_text(error)}"
-        if fault != endpoint.fault:
-            endpoint.fault = fault
-            self.configuration_changes.touch()
+            follow_goals(entity, functools.partial(self.note_fault, endpoint))
 
     def _watch_matches(self, kind: EndpointKind, entity: Any) -> Callable[[], None]:
         """Watch in the host's executor, for the node's own need not run; returns what ends that."""
@@ -195,7 +187,7 @@ class ForeignNode(NodeInHost):
         topic = given["topic"] if connection.participant is None else planned.resolved
         create = factory(planned, connection, self.node)
         entity = create(given["msg_type"], topic, *called, **options)
-        self._apart[id(entity)] = connection
+        self.made(kind, entity, connection)
         return entity
 
     def _planned(self, kind: EndpointKind, topic: object) -> PlannedEndpoint | None:

@@ -164,7 +164,7 @@ class Host:
             self._nodes[hosted.full_name] = hosted
             hosted.gate.measure(self._spec.apart)
             if hosted.spec.managed:
-                hosted.listeners.append(self._report_state)
+                hosted.listeners.append(lambda node: self._report("state", node, node.full_name))
             hosted.configuration_changes.listen(self._report_configuration)
             self._note_marks(hosted)
             self._loop.add(hosted)
@@ -195,9 +195,6 @@ class Host:
                 measured = hosted.gate.measured() if self._measures else None
                 if measured is not None:
                     self._channel.write(Event(kind="measured", node=name, measured=measured))
-
-    def _report_state(self, hosted: Hosted) -> None:
-        self._report("state", hosted, hosted.full_name)
 
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
         hosted = self._nodes.get(configuration.name)

@@ -30,9 +30,9 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
+from lifecycle.middleware.fastdds.participant import hidden_nodes, republish_names
 from lifecycle.middleware.process.busy_sign import BusySign, show_stacks_here
 from lifecycle.middleware.process.control import leave_and_exit
-from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import NodeExecutor, Watching, described, run
 from lifecycle.node.callbacks import hint
 from lifecycle.node.managed import Managed
@@ -94,7 +94,6 @@ class Heartbeat:
         self._last_s: dict[Node, float] = {}
         self._changing: set[str] = set()
         self._runs = False
-        sign.speak_for_process()
 
     def run(self, *, runs: bool) -> None:
         """Watch from now on, as the executor runs, or nothing any more."""
@@ -145,7 +144,7 @@ class Heartbeat:
             self._sign.end()
         else:
             due_s = min(self._last_s.values()) + self._period_s
-            self._sign.begin(due_s - time.monotonic())
+            self._sign.begin(due_s - time.monotonic(), for_process=True)
 
 
 _BEATS = 5
@@ -189,7 +188,13 @@ class NodeLoop:
         self._watchdog: Watchdog | None = None
         self._heartbeat: Heartbeat | None = None
         if executor is not Executor.SINGLE:
-            self._own = _executor(executor, threads, context)
+            if executor is Executor.EVENTS:
+                from rclpy.experimental.events_executor import EventsExecutor
+
+                self._own = EventsExecutor(context=context)
+            else:
+                count = threads or max(2, os.cpu_count() or 0)
+                self._own = MultiThreadedExecutor(count, context=context)
             self._heartbeat = Heartbeat(sign, on_overlong) if sign else None
         elif sign is not None:
             self._watchdog = Watchdog(sign, on_overlong)
@@ -356,15 +361,6 @@ class NodeLoop:
         )
         sys.stderr.flush()
         os._exit(self._code or 1)
-
-
-def _executor(kind: Executor, threads: int, context: Context) -> Any:
-    """Return rclpy's executor of a kind that has threads of its own."""
-    if kind is Executor.EVENTS:
-        from rclpy.experimental.events_executor import EventsExecutor
-
-        return EventsExecutor(context=context)
-    return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
 @contextlib.contextmanager

@@ -20,13 +20,13 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.graph.graph import Graph
 from lifecycle.graph.loop import set_within
 from lifecycle.middleware.fastdds.factory import unknown_versions
+from lifecycle.middleware.fastdds.participant import republish_names
 from lifecycle.middleware.fastdds.sockets import (
     give_up_dead_connections,
     send_again_soon,
     widen_discovery_buffers,
 )
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.rcl.hidden_node import republish_names
 from lifecycle.middleware.services.supervisor_topics import (
     AlivePublisher,
     AliveSubscription,

@@ -22,9 +22,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import codec
-from lifecycle.graph.events import EventKind, GraphEvent
 from lifecycle.graph.graph import Graph
-from lifecycle.graph.state import GraphState
+from lifecycle.graph.state import EventKind, GraphEvent, GraphState
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.process.shared_memory import sweep

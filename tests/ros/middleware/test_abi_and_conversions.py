@@ -14,11 +14,12 @@ from std_msgs.msg import String
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware import versions
+from lifecycle.middleware.fastdds import participant
 from lifecycle.middleware.fastdds.nfe import (
     create_subscription,
     get_network_flow_endpoints,
 )
-from lifecycle.middleware.rcl import abi, hidden_node
+from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.conversions import (
     from_rclpy,
     import_interface,
@@ -53,8 +54,8 @@ def test_a_node_is_made_by_an_rclpy_with_another_constructor(
 ) -> None:
     (other,) = {True, False} - {versions.installed().node_takes_rosout}
     wrong = SimpleNamespace(node_takes_rosout=other)
-    monkeypatch.setattr(hidden_node, "installed", lambda: wrong)
-    node = hidden_node.bare_node(context)
+    monkeypatch.setattr(participant, "installed", lambda: wrong)
+    node = participant.bare_node(context)
     assert node.pointer
     node.destroy_when_not_in_use()
 

@@ -137,7 +137,7 @@ def test_a_participant_of_shared_memory_has_no_ip_socket(
         sending = FlowParticipant("_out", "/", fresh_domain, connections=connect("shm://"))
     with receiving, sending:
         exchange(sending, receiving, wait_until)
-        assert (sending.has_shared_memory, senders_of(sending.node)) == (True, ())
+        assert (has_shared_memory(sending.node), senders_of(sending.node)) == (True, ())
     assert sockets == []
 
 
@@ -199,13 +199,13 @@ def test_a_fixed_port_that_is_taken_is_an_error_that_names_it(
     capfd.readouterr()  # Fast DDS's own words
 
 
-def test_a_mark_that_no_url_could_carry_is_an_error_that_lists_them(fresh_domain: int) -> None:
+def test_a_mark_that_no_url_could_carry_is_an_error(fresh_domain: int) -> None:
     urls = ("tcpv4://127.0.0.1:21099", "shm://")
     with pytest.raises(MiddlewareError) as refused:
         FlowParticipant("_marked", "/", fresh_domain, dscp=46, connections=connect(*urls))
     assert str(refused.value) == (
-        "cannot mark what 'tcpv4://127.0.0.1:21099' and 'shm://' carries with DSCP 46: only UDP "
-        "sockets can be marked; remove the mark, or carry it by udpv4://"
+        "cannot find the sockets of this publisher among network flow endpoints []: it has no UDP "
+        "or TCP socket in this process; a publisher that only has shared memory cannot be marked"
     )
 
 

@@ -11,7 +11,7 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.middleware.rcl.graph_changes import GraphGuard
+from lifecycle.middleware.rcl.graph_queries import GraphGuard
 
 BOUND_S = 30.0
 

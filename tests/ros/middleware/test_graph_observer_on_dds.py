@@ -21,11 +21,10 @@ from std_srvs.srv import Trigger
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
-from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.participant import FlowParticipant, quiet_node
 from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.rcl.graph_queries import endpoints_of
-from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.verify.observation import ObservedNode
 from tests.ros.faults.system import BARE_DDS
 from tests.ros.supervisor.running import ROOT

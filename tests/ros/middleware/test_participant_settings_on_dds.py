@@ -99,7 +99,7 @@ def carrying(datagrams: list[Datagram], text: str = MARK) -> list[Datagram]:
 
 def source_of(participant: FlowParticipant) -> tuple[NetworkFlowEndpoint, ...]:
     """A publisher's NFEs as a node reports them."""
-    return senders_of(participant.node) + (SHARED_MEMORY,) * participant.has_shared_memory
+    return senders_of(participant.node) + (SHARED_MEMORY,) * has_shared_memory(participant.node)
 
 
 # What Fast DDS 2.14 does between two processes of one host: shared memory exactly if both have it.
@@ -190,7 +190,7 @@ def test_chosen_transports_are_all_there_is_in_every_discovery_range(
         FlowParticipant("_same", "/", fresh_domain, transports=transports) as same,
         FlowParticipant("_plain", "/", fresh_domain) as plain,
     ):
-        assert (chosen.has_shared_memory, plain.has_shared_memory) == (False, True)
+        assert (has_shared_memory(chosen.node), has_shared_memory(plain.node)) == (False, True)
         spelt = {
             f"{nfe.transport_protocol.value}{nfe.internet_protocol.value[2:]}"
             for nfe in senders_of(chosen.node)
@@ -305,6 +305,7 @@ import sys
 from std_msgs.msg import String
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.factory import has_shared_memory
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
 for transports in ((), ("udpv4",), ()):
@@ -313,7 +314,7 @@ for transports in ((), ("udpv4",), ()):
             subscription = participant.create_subscription(String, "/a", print, QosProfile())
             nfes = get_network_flow_endpoints(subscription)
             port = max(each.transport_port for each in nfes)
-            print(participant.has_shared_memory, port - 250 * int(sys.argv[1]))
+            print(has_shared_memory(participant.node), port - 250 * int(sys.argv[1]))
     except MiddlewareError as error:
         print(error)
 """

@@ -21,7 +21,7 @@ from test_msgs.action import Fibonacci
 
 from lifecycle import LifecycleNode, on_message
 from lifecycle.middleware.services.actions import ActionClientGoneError
-from lifecycle.node.making import DeadlockError
+from lifecycle.node.endpoint import DeadlockError
 
 Active = Callable[..., Any]
 Ask = Callable[..., Asking]

@@ -279,8 +279,8 @@ def test_where_the_new_connection_fails_the_old_mapping_stays(
     with pytest.raises(ConnectError) as error:
         node.map_to("video", "")
     assert str(error.value).startswith(
-        "cannot map publisher 'video' of /it to '': cannot create publisher '/video' with network "
-        "flow endpoints strictly_required: "
+        "cannot map publisher 'video' of /it to '': publisher 'video' must have a network flow "
+        "for itself (strictly_required), and those of the node's own participant share one"
     )
     assert node.mappings == (("publishers/map", "net"), ("publishers/video", "own"))
     assert driver.set("/it", "connect")

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from lifecycle.graph.events import EventKind, GraphEvent, GraphEvents
-from lifecycle.graph.state import GraphState
+from lifecycle.graph.state import EventKind, GraphEvent, GraphEvents, GraphState
 from lifecycle.graph.status import MappingStatus, NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import EndpointReport

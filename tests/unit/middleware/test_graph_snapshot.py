@@ -32,18 +32,28 @@ class End:
     prefix: str
 
 
+class Context:
+    """Of who looks."""
+
+    def get_domain_id(self) -> int:
+        """Return its domain."""
+        return 7
+
+
 @dataclasses.dataclass
 class Graph:
     """What rclpy shows: the queries that a snapshot makes, of these ends."""
 
     ends: list[End]
-    context: SimpleNamespace = dataclasses.field(
-        default_factory=lambda: SimpleNamespace(get_domain_id=lambda: 7)
-    )
+    context: Context = dataclasses.field(default_factory=Context)
 
     def get_fully_qualified_name(self) -> str:
         """Return that of the node that looks."""
         return "/looks"
+
+    def resolve_topic_name(self, name: str) -> str:
+        """Return a name as it is."""
+        return name
 
     def get_topic_names_and_types(self, *, no_demangle: bool) -> list[tuple[str, list[str]]]:
         """Return DDS's names; raise at one that is no UTF-8."""

@@ -17,7 +17,6 @@ from lifecycle.middleware.fastdds.sockets import (
     check_free,
     check_host,
     give_up_dead_connections,
-    is_used,
     open_sockets,
     send_again_soon,
     sockets_here,
@@ -185,27 +184,6 @@ def test_a_connection_that_nobody_takes_is_given_up_and_one_that_lives_is_not() 
         assert _state(dialled[-1]) != _SYN_SENT
         assert [_state(each) for each in alive] == [_ESTABLISHED] * len(alive)
     assert give_up_dead_connections() == 0
-
-
-def test_a_connection_is_unused_if_nothing_follows_the_answer_to_its_first_request() -> None:
-    deadline = time.monotonic() + 30
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address, port = server.getsockname()
-        assert is_used(address, port) is None
-        with socket.create_connection((address, port)) as dialled:
-            taken, _ = server.accept()
-            with taken:
-                dialled.sendall(bytes(68))
-                assert is_used(address, port) is None  # the answer may be on its way
-                taken.sendall(bytes(68))
-                while is_used(address, port) is None:
-                    assert time.monotonic() < deadline
-                    time.sleep(0.01)
-                assert is_used(address, port) is False
-                dialled.sendall(bytes(38))
-                while not is_used(address, port):
-                    assert time.monotonic() < deadline
-                    time.sleep(0.01)
 
 
 _TCP_RTO_MAX_MS = 44
