@@ -57,9 +57,8 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters
-from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
-from lifecycle.plan.wiring import wire
+from lifecycle.plan.wiring import place, wire
 from lifecycle.printable import listed
 
 
