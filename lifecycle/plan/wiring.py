@@ -401,7 +401,7 @@ def place_static(
         for each in node.participants
         if _is_static(each)
     }
-    urls = meshed(ports, kind, hosts)
+    urls = meshed(ports, kind)
     table = tuple(_table(placed))
 
     def connected(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
