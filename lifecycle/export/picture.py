@@ -372,7 +372,7 @@ class _Builder:
             notes = list(_demands(planned)) if planned else []
             label, unique = "", False
             if planned and not self._verdict:
-                dscp = next((each.planned.dscp for each in planned.publishers), None)
+                dscp = planned.writer.planned.dscp if planned.writer else None
                 label = _label(planned.planned.medium, dscp)
                 unique = planned.planned.unique is not UniqueHow.NOT
             if sent != taken:

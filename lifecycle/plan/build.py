@@ -11,7 +11,8 @@ import functools
 import graphlib
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -57,9 +58,8 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters
-from lifecycle.plan.participants import place
 from lifecycle.plan.processes import planned_processes
-from lifecycle.plan.wiring import wire
+from lifecycle.plan.wiring import place, wire
 from lifecycle.printable import listed
 
 
@@ -81,7 +81,7 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     return tuple(levels)
 
 
-_STRENGTH = {UniqueHow.NOT: 0, UniqueHow.WEAKLY: 1, UniqueHow.STRONGLY: 2}
+_STRENGTH = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
 def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[PlannedFlow, ...]:
@@ -90,47 +90,43 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
     Several links on one pair add up: the strongest uniqueness and the shortest delay hold. A link
     that names two nodes is kept even if they declare no such endpoints, so that it can be judged.
     """
-    subscribers: dict[str, list[str]] = {}
-    for node in nodes:
-        for topic in _topics(node, EndpointKind.SUBSCRIPTION):
-            subscribers.setdefault(topic, []).append(node.key)
+    ends = [(node, each) for node in nodes for each in node.endpoints]
+    readers: dict[str, list[str]] = {}
+    for node, each in ends:
+        if each.kind is EndpointKind.SUBSCRIPTION:
+            readers.setdefault(each.resolved, []).append(node.key)
     pairs: dict[tuple[str, str, str], list[Link]] = {
-        (topic, publisher.key, subscription): []
-        for publisher in nodes
-        for topic in _topics(publisher, EndpointKind.PUBLISHER)
-        for subscription in subscribers.get(topic, ())
+        (each.resolved, node.key, reader): []
+        for node, each in ends
+        if each.kind is EndpointKind.PUBLISHER
+        for reader in readers.get(each.resolved, ())
     }
     for link in links:
         pairs.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
-    asked = {(node.key, each.resolved) for node in nodes for each in node.endpoints if each.measure}
+    measured = {(node.key, each.resolved) for node, each in ends if each.measure}
     foreign = {node.key for node in nodes if node.run.kind is not RunKind.PYTHON}
-    found = []
-    for pair, on_it in pairs.items():
-        topic, *ends = pair
-        measure = any(each.measure for each in on_it) or any((end, topic) in asked for end in ends)
-        found.append(replace(_flow(pair, on_it), measure=measure and ends[1] in foreign))
-    return tuple(found)
-
-
-def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:
-    return dict.fromkeys(each.resolved for each in node.endpoints if each.kind is kind)
-
-
-def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
-    topic, publisher, subscription = pair
-    asked = [link.transport for link in named if link.transport is not FlowTransport.ANY]
-    delays = [link.max_delay_ms for link in named if link.max_delay_ms is not None]
-    return PlannedFlow(
-        topic=topic,
-        publisher=publisher,
-        subscription=subscription,
-        unique=max(
-            (link.unique for link in named), key=_STRENGTH.__getitem__, default=UniqueHow.NOT
-        ),
-        max_delay_ms=min(delays, default=None),
-        linked=bool(named),
-        transport=next(iter(asked), FlowTransport.ANY),
-        quantities=tuple(each for link in named for each in link.quantities),
+    return tuple(
+        PlannedFlow(
+            topic=topic,
+            publisher=publisher,
+            subscription=subscription,
+            unique=max((each.unique for each in named), key=_STRENGTH.index, default=UniqueHow.NOT),
+            max_delay_ms=min(
+                (each.max_delay_ms for each in named if each.max_delay_ms is not None), default=None
+            ),
+            linked=bool(named),
+            transport=next(
+                (each.transport for each in named if each.transport is not FlowTransport.ANY),
+                FlowTransport.ANY,
+            ),
+            quantities=tuple(number for each in named for number in each.quantities),
+            measure=subscription in foreign
+            and (
+                any(each.measure for each in named)
+                or not measured.isdisjoint({(publisher, topic), (subscription, topic)})
+            ),
+        )
+        for (topic, publisher, subscription), named in pairs.items()
     )
 
 
@@ -157,15 +153,9 @@ def build_plan(
     if domain_id is not None:
         discovery = msgspec.structs.replace(manifest.discovery, domain_id=domain_id)
         manifest = replace(manifest, discovery=discovery)
-    discovery_range = effective_range(manifest.discovery, variables)
     parameters = NodeParameters(ParameterFiles(manifest.path), manifest.modes)
     plan = _wired(manifest, variables, parameters)
-    plan = replace(plan, discovery_range=discovery_range)
-    plan = replace(
-        plan,
-        processes=planned_processes(manifest.nodes, plan, variables),
-        levels=dependency_levels(manifest.nodes),
-    )
+    plan = replace(plan, processes=planned_processes(manifest.nodes, plan, variables))
     return in_mode(plan, plan.modes[0].name) if plan.modes else plan
 
 
@@ -289,8 +279,7 @@ def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[D
 
 
 def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodeParameters) -> Plan:
-    """Plan nodes, flows and how they are connected, but no processes and no order yet."""
-    domain_id = effective_domain(manifest.discovery, variables)
+    """Plan nodes, flows, order and how they are connected, but no processes yet."""
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
@@ -301,12 +290,12 @@ def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodePar
     plan = Plan(
         **{**declared(SystemDeclaration, manifest), "modes": tuple(map(_portable, manifest.modes))},
         manifest_path=manifest.path,
-        domain_id=domain_id,
-        discovery_range=DiscoveryRange.SYSTEM_DEFAULT,
+        domain_id=effective_domain(manifest.discovery, variables),
+        discovery_range=effective_range(manifest.discovery, variables),
         processes=(),
         nodes=nodes,
         flows=planned_flows(nodes, manifest.links),
-        levels=(),
+        levels=dependency_levels(manifest.nodes),
         rmw=variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW,
     )
     return wire(plan, manifest.links)
@@ -430,21 +419,21 @@ def _digest(path: str) -> str:
 def _planned_endpoint(
     node: Node, endpoint: Endpoint, need: ResolvedNeed | None, hash_of: Callable[[str], str]
 ) -> PlannedEndpoint:
-    planned = PlannedEndpoint(
+    asked: dict[str, Any] = {}
+    if need is not None:
+        asked = {
+            **{name: getattr(need.need, name) for name in _ASKED},
+            "dscp": need.dscp,
+            "enforce_dscp": need.need.enforce,
+            "five_qi": need.five_qi,
+            "five_qi_reason": need.flow_class.reason,
+            "max_delay_ms": need.max_delay_ms,
+        }
+    return PlannedEndpoint(
         **declared(Endpoint, endpoint),
         resolved=name_in_graph(node, endpoint.name, endpoint.kind),
         type_hash=hash_of(endpoint.type),
-    )
-    if need is None:
-        return planned
-    return replace(
-        planned,
-        **{name: getattr(need.need, name) for name in _ASKED},
-        dscp=need.dscp,
-        enforce_dscp=need.need.enforce,
-        five_qi=need.five_qi,
-        five_qi_reason=need.flow_class.reason,
-        max_delay_ms=need.max_delay_ms,
+        **asked,
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -84,22 +84,6 @@ class Hosts(msgspec.Struct, frozen=True, kw_only=True):
         """Whether the system runs on more than one host."""
         return len(self.used) > 1
 
-    def address(self, host: str, *, ipv6: bool = False) -> str:
-        """Return what others reach a host by; loopback, of IPv6 if asked for, of the only host.
-
-        Raises:
-            PlanError: the host has no address, and others are to reach it.
-        """
-        if host or not self.several:
-            return host or (LOOPBACK6 if ipv6 else LOOPBACK)
-        names = ", ".join(map(repr, self.names(""))) or "this host"
-        raise PlanError(
-            f"cannot give fixed ports to machine {names}: it has no address, and others must reach "
-            "it",
-            hint="add 'address:' to it under 'machines:'",
-            at=next((each.at for each in self.machines if not each.address), None),
-        )
-
 
 class PortPool:
     """Ports, 1–65535, that are still free on each host, UDP and TCP alike."""
@@ -107,7 +91,7 @@ class PortPool:
     def __init__(self, first: int, taken: Mapping[str, Iterable[int]] | None = None) -> None:
         self._first = first
         self._taken = {host: set(ports) for host, ports in (taken or {}).items()}
-        self._lowest: dict[str, int] = {}  # from `first` to below it, all of a host's are taken
+        self._left: dict[str, Iterator[int]] = {}  # those of a host that were not looked at yet
 
     def take(self, host: str, count: int = 1) -> tuple[int, ...]:
         """Give out the lowest free ports of a host.
@@ -116,8 +100,8 @@ class PortPool:
             PlanError: there are none left.
         """
         taken = self._taken.setdefault(host, set())
-        every = range(self._lowest.get(host, self._first), MAX_PORT + 1)
-        found = tuple(itertools.islice((port for port in every if port not in taken), count))
+        left = self._left.setdefault(host, iter(range(self._first, MAX_PORT + 1)))
+        found = tuple(itertools.islice((port for port in left if port not in taken), count))
         if len(found) < count:
             what = f"cannot give out {count} more ports{f' on {host}' if host else ''}"
             raise PlanError(
@@ -127,7 +111,6 @@ class PortPool:
                 hint="lower 'discovery.first_port'",
             )
         taken.update(found)
-        self._lowest[host] = max(found, default=self._first - 1) + 1
         return found
 
     def take_everywhere(self, hosts: Sequence[str], first: int) -> int:
@@ -300,7 +283,7 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
     extra ones where endpoints are static: they carry data and become connections (`place_static`).
 
     Raises:
-        PlanError: a host has no address, or too few ports.
+        PlanError: a host has too few ports.
     """
     discovery, server = plan.discovery, None
     transport = control_transport(discovery, hosts)
@@ -308,7 +291,7 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
         tcp = transport.medium is not None and transport.medium.is_tcp
         at = hosts.host(hosts.server)
         server = PlannedServer(
-            machine=hosts.server, address=hosts.address(at), port=pool.take(at)[0], tcp=tcp
+            machine=hosts.server, address=at or LOOPBACK, port=pool.take(at)[0], tcp=tcp
         )
     ports = {host: pool.take(host, 4) for host in hosts.used}
     if transport is FlowTransport.ANY:
@@ -335,7 +318,7 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
             slots[slot] = (host, pool.take(host, kind.ports) if planned else ())
     urls = dict.fromkeys(slots, str(ConnectionUrl(transport=kind)))
     if planned:
-        urls = meshed(slots, kind, hosts, server=server)
+        urls = meshed(slots, kind, server=server)
 
     def connected(slot: _Slot) -> ParticipantConnections:
         observes = server is not None and slot[0] == "observer"
@@ -370,7 +353,6 @@ _Key = TypeVar("_Key")
 def meshed(
     ports: Mapping[_Key, tuple[str, tuple[int, ...]]],
     kind: Medium,
-    hosts: Hosts,
     *,
     server: PlannedServer | None = None,
 ) -> dict[_Key, str]:
@@ -379,17 +361,11 @@ def meshed(
     Args:
         ports: of each participant its host, and its ports as `fixed_url` takes them.
         kind: what all of them are connected by.
-        hosts: of the system.
         server: by which they find each other; None: each looks for all others.
-
-    Raises:
-        PlanError: a host has no address.
     """
-    v6 = kind.ip_version == 6
-    alone = {
-        key: fixed_url(kind, hosts.address(host, ipv6=v6), taken)
-        for key, (host, taken) in ports.items()
-    }
+    # Of several hosts each has an address (check.discovery-address).
+    loopback = LOOPBACK6 if kind.ip_version == 6 else LOOPBACK
+    alone = {key: fixed_url(kind, host or loopback, taken) for key, (host, taken) in ports.items()}
     if server is not None:
         at = (Peer(address=server.address, port=server.port),)
         return {key: str(replace(url, server=at, multicast=True)) for key, url in alone.items()}
@@ -482,6 +458,6 @@ def _with_tcp(
     if any(each.transport.is_tcp for each in urls):
         return urls
     # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
-    address = LOOPBACK if ":" in host else hosts.address(host) if host or not hosts.several else ""
+    address = LOOPBACK if ":" in host or not (host or hosts.several) else host
     port = observers.ports[host][3]
     return [*urls, ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port)]

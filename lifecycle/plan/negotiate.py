@@ -20,16 +20,20 @@ from lifecycle.manifest.names import free_name
 from lifecycle.network.connection_url import ConnectionUrl, parse
 from lifecycle.network.medium import CONNECTABLE, LOOPBACK, UDP_UNICAST, Medium, medium_of
 from lifecycle.plan.discovery import Contact, PortPool, contacts_of, fixed_url, peers_by, ports_of
-from lifecycle.plan.media import MEETING, Pair, carried, choose, discover
-from lifecycle.plan.model import PlanError, PlannedEndpoint
-from lifecycle.plan.parties import (
+from lifecycle.plan.media import (
+    MEETING,
     DataLayerGraph,
     End,
     NegotiatedConnection,
     NegotiatedFlow,
+    Pair,
     Party,
     Terms,
+    carried,
+    choose,
+    discover,
 )
+from lifecycle.plan.model import PlanError, PlannedEndpoint
 
 Wishes = Mapping[tuple[str, str, str], FlowTransport]
 """What links demand: (topic, key of the publishing party, key of the subscribing one)."""

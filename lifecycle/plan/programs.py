@@ -7,6 +7,8 @@ it, or another host, can show is named as unresolved.
 
 from __future__ import annotations
 
+import ast
+import difflib
 import functools
 import importlib.util
 import os
@@ -25,12 +27,15 @@ from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.processes import find_executable
 from lifecycle.plan.python_source import (
+    ACCESS,
     ClassKind,
+    Handler,
     NodeClass,
+    NoModuleError,
     NotThereError,
     Sources,
     UnknownError,
-    Use,
+    binds,
 )
 
 RULE = "program.missing"
@@ -46,6 +51,14 @@ _WORDS = {
     EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
     EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
 }
+_DECLARES = {
+    *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
+    *("declare_action", "declare_action_client"),
+}
+_CALLBACKS = (
+    *("on_configure", "on_connect", "on_activate", "on_deactivate"),
+    *("on_disconnect", "on_cleanup", "on_shutdown", "on_error"),
+)
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
@@ -89,16 +102,13 @@ def resolve_programs(
             unresolved. Code that is found here is judged for them, too.
     """
     sources = functools.cache(Sources)
-
-    @functools.cache
-    def read(folders: tuple[str, ...], module: str, name: str) -> NodeClass:
-        return sources(folders).read_class(module, name)
-
-    found = [
-        each
-        for node in manifest.nodes
-        for each in _look(node, read, environment, ours=is_ours(node.machine))
-    ]
+    found: list[_Found] = []
+    for node in manifest.nodes:
+        ours = is_ours(node.machine)
+        if node.run.kind is RunKind.PYTHON:
+            found += _python(node, sources(_folders(node)), ours=ours)
+        elif node.run.kind is RunKind.COMMAND:
+            found += _command(node, environment, ours=ours)
     return Resolution(
         diagnostics=tuple(each for each in found if isinstance(each, Diagnostic)),
         unresolved=tuple(each for each in found if isinstance(each, UnresolvedProgram)),
@@ -106,33 +116,25 @@ def resolve_programs(
 
 
 _Found = Diagnostic | UnresolvedProgram
-_Read = Callable[[tuple[str, ...], str, str], NodeClass]
-"""Returns the class of a name in a module, which is looked for in some folders first."""
 
 
-def _look(
-    node: Node, read: _Read, environment: Mapping[str, str], *, ours: bool
-) -> Iterator[_Found]:
+def _command(node: Node, environment: Mapping[str, str], *, ours: bool) -> Iterator[_Found]:
     run = node.run
-    if run.kind is RunKind.PYTHON:
-        yield from _python(node, read, ours=ours)
-    elif run.kind is RunKind.COMMAND:
-        part, subject = "run.command", f"program {run.command[0]!r}" if run.command else ""
-        if not run.command:
+    try:
+        if run.command:
+            part, subject = "run.command", f"program {run.command[0]!r}"
+            _find_command(run, environment)
+        else:
             part = "run.executable"
             subject = f"executable {run.executable!r} of package {run.package!r}"
-        try:
-            if run.command:
-                _find_command(run, environment)
-            else:
-                find_executable(run, environment, at=node.at)
-        except (NotThereError, PlanError) as problem:
-            if run.command or environment.get("AMENT_PREFIX_PATH"):
-                yield _missing(node, part, subject, problem, ours=ours)
-            else:
-                reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
-                at = _at(node, "run.package")
-                yield UnresolvedProgram(at=at, subject=subject, reason=reason)
+            find_executable(run, environment, at=node.at)
+    except (NotThereError, PlanError) as problem:
+        if run.command or environment.get("AMENT_PREFIX_PATH"):
+            yield _missing(node, part, subject, problem, ours=ours)
+        else:
+            reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
+            at = _at(node, "run.package")
+            yield UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
 def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ours: bool) -> _Found:
@@ -144,7 +146,7 @@ def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ou
     return UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
-def _python(node: Node, read: _Read, *, ours: bool) -> Iterator[_Found]:
+def _python(node: Node, sources: Sources, *, ours: bool) -> Iterator[_Found]:
     subject = f"class {node.run.python!r}"
     at = _at(node, "run.python")
     module, separator, name = node.run.python.partition(":")
@@ -152,11 +154,10 @@ def _python(node: Node, read: _Read, *, ours: bool) -> Iterator[_Found]:
         yield error(RULE, at, f"cannot read {node.run.python!r}; write package.module:Class")
         return
     try:
-        found = read(_folders(node), module, name)
+        found = sources.read_class(module, name)
     except NotThereError as problem:
         # A module that is not here may be there; one that is here lacks the class there, too.
-        is_missing_module = problem.message.startswith("cannot find module")
-        here = ours or not is_missing_module
+        here = ours or not isinstance(problem, NoModuleError)
         yield _missing(node, "run.python", subject, problem, ours=here)
         return
     except UnknownError as problem:
@@ -172,7 +173,14 @@ def _python(node: Node, read: _Read, *, ours: bool) -> Iterator[_Found]:
         return
     yield from _called(node, found, at)
     yield from _without_health(node, found)
-    yield from _slips(node, found, at, ours=ours)
+    # What of a class is unknown may bring along what seems to be missing.
+    if ours and not found.unknown and importlib.util.find_spec("rclpy"):
+        for package, place in sources.missing(found):
+            message = f"cannot import {package!r}, as {place} does: it is not installed here"
+            yield warning(IMPORT, at, message, "install it where the node runs")
+    yield from _uncalled(found, at)
+    if not found.unknown and not node.parameter_files:
+        yield from _parameters(node, found, at)
     yield from _interface(node, found, at, subject)
 
 
@@ -186,7 +194,12 @@ def _interface(node: Node, found: NodeClass, at: Position, subject: str) -> Iter
         yield UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
         # What is there is there, whatever else may be.
         problems = [each for each in problems if each.message.startswith("cannot use")]
-    if found.declares and (problems or asks):
+    declares = any(
+        isinstance(each, ast.Attribute) and each.attr in _DECLARES
+        for _, statement in found.body
+        for each in ast.walk(statement)
+    )
+    if declares and (problems or asks):
         first = f"; {problems[0].message}" if problems else ""
         reason = f"its code declares endpoints itself{first}"
         yield UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
@@ -246,21 +259,24 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
     """Yield that a node is to be asked for its health whose class has nothing to ask."""
     if node.health is None or not node.health.check or not node.managed:
         return
+    why = ""
     if found.kind in (ClassKind.MANAGED, ClassKind.PLAIN):
-        yield error(
-            NO_HEALTH,
-            node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {found} is not a "
-            "lifecycle.LifecycleNode",
-            "derive it from lifecycle.LifecycleNode, or write 'health: {diagnostics: NAME}'",
+        why, advice = "is not a lifecycle.LifecycleNode", "derive it from lifecycle.LifecycleNode"
+    elif (
+        found.kind is ClassKind.OURS
+        and not found.unknown
+        and not any("health" in binds(statement) for _, statement in found.body)
+    ):
+        why = "has no method 'health'"
+        advice = (
+            "give it 'def health(self)', which returns None if all is well and else what is wrong"
         )
-    elif found.kind is ClassKind.OURS and not found.has_health and not found.unknown:
+    if why:
         yield error(
             NO_HEALTH,
             node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {found} has no method 'health'",
-            "give it 'def health(self)', which returns None if all is well and else what is "
-            "wrong, or write 'health: {diagnostics: NAME}'",
+            f"cannot ask {node.key!r} whether it is healthy: {found} {why}",
+            f"{advice}, or write 'health: {{diagnostics: NAME}}'",
         )
 
 
@@ -310,7 +326,7 @@ def _names(folder: Path) -> tuple[str, ...]:
 def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
     """Yield what `node.handlers.match` would refuse when the node is configured."""
     wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
-    taken: dict[tuple[EndpointKind, str, bool], Use] = {}
+    taken: dict[tuple[EndpointKind, str, bool], Handler] = {}
     for each in found.handlers:
         noun, decorator = _WORDS[each.kind]
         decorator = "@on_goal" if each.decides else decorator
@@ -343,35 +359,68 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
 
 
 def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    for each in dict.fromkeys(found.asks):
-        declared = [e.name for e in node.interface.endpoints if e.kind is each.kind]
-        if each.name not in declared:
-            yield warning(
-                UNDECLARED,
-                at,
-                f"cannot tell what {each.text} ({each.place}) is to get: {node.key!r} declares no "
-                f"{each.kind.noun} {each.name!r}",
-                _declared(each.name, declared),
-            )
+    """Yield the endpoints that code asks for by a literal name, and that are not declared."""
+    for of, method in found.methods:
+        for call in ast.walk(method):
+            match call:
+                case ast.Call(
+                    func=ast.Attribute(value=ast.Name(id="self"), attr=attr),
+                    args=[ast.Constant(value=str(name))],
+                ) if attr in ACCESS:
+                    kind = ACCESS[attr]
+                    declared = [e.name for e in node.interface.endpoints if e.kind is kind]
+                    if name not in declared:
+                        yield warning(
+                            UNDECLARED,
+                            at,
+                            f"cannot tell what {ast.unparse(call)[:80]} ({of.place(call)}) is to "
+                            f"get: {node.key!r} declares no {kind.noun} {name!r}",
+                            _declared(name, declared),
+                        )
 
 
-def _slips(node: Node, found: NodeClass, at: Position, *, ours: bool) -> Iterator[Diagnostic]:
-    """Yield what the code of a class says that will not be there, or that nothing calls."""
-    for each in found.missing if ours and importlib.util.find_spec("rclpy") else ():
-        message = f"cannot import {each.name!r}, as {each.place} does: it is not installed here"
-        yield warning(IMPORT, at, message, "install it where the node runs")
-    for each in found.uncalled if found.kind is not ClassKind.PLAIN else ():
-        message = f"cannot tell what {each.name} ({each.place}) is for: nothing calls it"
-        yield warning(UNCALLED, at, message, f"did you mean {each.near!r}?")
+def _uncalled(found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+    """Yield methods that are called almost as a transition callback is, and by nothing."""
+    for of, method in found.methods if found.kind is not ClassKind.PLAIN else ():
+        name = method.name
+        if not name.startswith("on_") or name in _CALLBACKS or method.decorator_list:
+            continue
+        near = difflib.get_close_matches(name, _CALLBACKS, n=1, cutoff=0.85)
+        if near and len(re.findall(rf"\b{name}\b", of.module.text)) == 1:
+            what = f"{of.node.name}.{name} ({of.place(method)})"
+            message = f"cannot tell what {what} is for: nothing calls it"
+            yield warning(UNCALLED, at, message, f"did you mean {near[0]!r}?")
+
+
+def _parameters(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+    """Yield the parameters that code gets by a literal name, and that nothing declares."""
+    gets: list[tuple[str, str]] = []
     declared = [each.name for each in node.interface.parameters]
     known = {*declared, *(name for name, _ in node.parameters)}
-    for each in found.reads if not node.parameter_files else ():
-        if each.name not in known and not is_implicit(each.name):
+    for of, statement in found.body:
+        for part in ast.walk(statement):
+            match part:
+                case ast.Call(
+                    func=ast.Attribute(attr="declare_parameter"), args=[ast.Constant(name), *_]
+                ):
+                    known.add(str(name))
+                case ast.Call(func=ast.Attribute(attr="declare_parameter"), args=[_, *_]):
+                    return  # under a name that only running it shows
+                case ast.Attribute(attr="declare_parameters"):
+                    return
+                case ast.keyword(arg=str(word)) if "_parameters" in word:
+                    return  # allow_undeclared_parameters and its like
+                case ast.Call(
+                    func=ast.Attribute(value=ast.Name(id="self"), attr="get_parameter"),
+                    args=[ast.Constant(value=str(name))],
+                ):
+                    gets.append((name, of.place(part)))
+    for name, place in gets:
+        if name not in known and not is_implicit(name):
             message = (
-                f"cannot get parameter {each.name!r} in {each.place}: {node.key!r} declares none "
-                "of that name"
+                f"cannot get parameter {name!r} in {place}: {node.key!r} declares none of that name"
             )
-            yield warning(PARAMETER, at, message, _declared(each.name, declared))
+            yield warning(PARAMETER, at, message, _declared(name, declared))
 
 
 def _declared(name: str, declared: list[str]) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import difflib
 import enum
 import importlib.machinery
 import importlib.util
@@ -35,28 +34,23 @@ _HANDLERS = {
     "on_goal": EndpointKind.ACTION_SERVER,
 }
 _HARMLESS = {"override", "abstractmethod", "on_timer", "setter", "getter", "deleter"}
-_ACCESS = {
+ACCESS = {
     "publisher": EndpointKind.PUBLISHER,
     "client": EndpointKind.SERVICE_CLIENT,
     "action_client": EndpointKind.ACTION_CLIENT,
 }
-_DECLARES = {
-    *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
-    *("declare_action", "declare_action_client"),
-}
-_CALLBACKS = tuple(
-    f"on_{each}"
-    for each in (
-        *("configure", "connect", "activate", "deactivate"),
-        *("disconnect", "cleanup", "shutdown", "error"),
-    )
-)
+"""Methods of a LifecycleNode by which its code asks for an endpoint, by name."""
+
 _OF_HOST = {"rclpy.init", "rclpy.spin", "rclpy.shutdown", "init", "spin", "shutdown"}
 """What a script's `main` calls, and a host does itself."""
 
 
 class NotThereError(LifecycleError):
     """Python would refuse it: no such module, no such class."""
+
+
+class NoModuleError(NotThereError):
+    """There is no such module here; elsewhere there may be one."""
 
 
 class UnknownError(LifecycleError):
@@ -76,72 +70,8 @@ class ClassKind(enum.Enum):
 
 _NODES = (ClassKind.OURS, ClassKind.MANAGED, ClassKind.PLAIN)
 
-
-class Use(msgspec.Struct, frozen=True, kw_only=True):
-    """A handler of an endpoint, or where code asks for one by a literal name.
-
-    Attributes:
-        text: `Class.method`, or `self.publisher('chatter')`.
-        place: `file:line`.
-        decides: a handler that decides on an action's goals, instead of executing them.
-    """
-
-    kind: EndpointKind
-    name: str
-    text: str
-    place: str
-    decides: bool = False
-
-
-class Slip(msgspec.Struct, frozen=True, kw_only=True):
-    """What its code says that nothing answers to.
-
-    Attributes:
-        name: of a parameter, a method or a module.
-        place: `file:line`.
-        near: what was meant, where that is likely.
-    """
-
-    name: str
-    place: str
-    near: str = ""
-
-
-class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
-    """What the source of a class, or of a function that returns nodes, shows.
-
-    Attributes:
-        takes: keyword arguments that it is called with; None where any is taken, or nothing is
-            known.
-        needs: those of them without a default.
-        spins: where a function calls what its host has done or does, `rclpy.spin (nodes.py:7)`.
-        handlers: its decorated methods.
-        asks: the endpoints that its code asks for.
-        unknown: why more may belong to it than is known; empty if nothing does.
-        declares: its code declares endpoints itself.
-        has_health: it, or a base of it, has a `health` method of its own.
-        reads: parameters that it gets by a literal name, and does not declare itself.
-        uncalled: methods that are called almost as a transition callback is, and by nothing.
-        missing: packages that its module imports, and that are not installed here.
-    """
-
-    name: str
-    file: str
-    kind: ClassKind
-    takes: tuple[str, ...] | None = None
-    needs: tuple[str, ...] = ()
-    spins: str = ""
-    handlers: tuple[Use, ...] = ()
-    asks: tuple[Use, ...] = ()
-    unknown: str = ""
-    declares: bool = False
-    has_health: bool = False
-    reads: tuple[Slip, ...] = ()
-    uncalled: tuple[Slip, ...] = ()
-    missing: tuple[Slip, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{self.name} ({self.file or 'rclpy'})"
+Function = (ast.FunctionDef, ast.AsyncFunctionDef)
+AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 class _Module(msgspec.Struct):
@@ -159,19 +89,68 @@ class _Module(msgspec.Struct):
         return bound[0] if len(bound) == 1 else None
 
 
-_Function = (ast.FunctionDef, ast.AsyncFunctionDef)
-_AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
-
-
-class _Definition(msgspec.Struct, frozen=True):
+class Definition(msgspec.Struct, frozen=True):
     """A class or function, and the module that defines it."""
 
     module: _Module
-    node: ast.ClassDef | _AnyFunction
+    node: ast.ClassDef | AnyFunction
 
     def place(self, node: ast.stmt | ast.expr) -> str:
         """Return where a part of it is, `file:line`."""
         return f"{_shown(self.module.file)}:{node.lineno}"
+
+
+class Handler(msgspec.Struct, frozen=True, kw_only=True):
+    """A method that is decorated as the handler of an endpoint.
+
+    Attributes:
+        text: `Class.method`.
+        place: `file:line`.
+        decides: it decides on an action's goals, instead of executing them.
+    """
+
+    kind: EndpointKind
+    name: str
+    text: str
+    place: str
+    decides: bool
+
+
+class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
+    """What the source of a class, or of a function that returns nodes, shows.
+
+    Attributes:
+        file: empty of a class of rclpy.
+        takes: keyword arguments that it is called with; None where any is taken, or nothing is
+            known.
+        needs: those of them without a default.
+        spins: where a function calls what its host has done or does, `rclpy.spin (nodes.py:7)`.
+        bases: the class and its bases, as far as they were found; none of a function.
+        unknown: why more may belong to it than is known; empty if nothing does.
+    """
+
+    name: str
+    file: str
+    kind: ClassKind
+    takes: tuple[str, ...] | None = None
+    needs: tuple[str, ...] = ()
+    spins: str = ""
+    bases: tuple[Definition, ...] = ()
+    handlers: tuple[Handler, ...] = ()
+    unknown: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.file or 'rclpy'})"
+
+    @property
+    def body(self) -> list[tuple[Definition, ast.stmt]]:
+        """The statements of the class and its bases."""
+        return [(each, one) for each in self.bases for one in each.node.body]
+
+    @property
+    def methods(self) -> list[tuple[Definition, AnyFunction]]:
+        """Their methods, those of the class first."""
+        return [(each, method) for each, method in self.body if isinstance(method, Function)]
 
 
 class Sources:
@@ -191,8 +170,8 @@ class Sources:
         """
         found = self._named(self._module(module), name, 0)
         if isinstance(found, str):
-            kinds = {each.value: each for each in _NODES}
-            return NodeClass(name=name, file="", kind=kinds.get(found, ClassKind.UNKNOWN))
+            kind = next((each for each in _NODES if each.value == found), ClassKind.UNKNOWN)
+            return NodeClass(name=name, file="", kind=kind)
         if isinstance(found.node, ast.ClassDef):
             return self._described(found)
         takes, needs = _arguments(found.node.args)
@@ -205,121 +184,91 @@ class Sources:
             spins=_spins(found),
         )
 
-    def _described(self, value: _Definition) -> NodeClass:
-        line, known, unknown = self._line(value)
-        body = [(each, statement) for each in line for statement in each.node.body]
-        methods = [(each, method) for each, method in body if isinstance(method, _Function)]
-        takes: tuple[str, ...] | None = None
-        needs: tuple[str, ...] = ()
-        constructor = next((each for _, each in methods if each.name == "__init__"), None)
-        if constructor and not unknown:
-            takes, needs = _arguments(constructor.args, is_method=True)
+    def _described(self, value: Definition) -> NodeClass:
+        bases, known, unknown = self._bases(value)
         kind = next((each for each in _NODES if each.value in known), ClassKind.NO_NODE)
         if unknown and kind in (ClassKind.PLAIN, ClassKind.NO_NODE):
             kind = ClassKind.UNKNOWN
-        handlers: dict[str, list[Use]] = {}  # a method hides those of its name in the bases
-        for each, method in methods:
-            marks, why = self._marks(each, method)
-            unknown = unknown or why
-            if marks:
-                handlers.setdefault(method.name, marks)
-        for each, statement in body:
-            if _makes_methods(statement):
-                why = f"methods of {each.node.name} are made in line {statement.lineno}"
-                unknown = unknown or why
-        return NodeClass(
+        found = NodeClass(
             name=value.node.name,
             file=_shown(value.module.file),
             kind=kind,
+            bases=bases,
+            unknown=unknown,
+        )
+        takes: tuple[str, ...] | None = None
+        needs: tuple[str, ...] = ()
+        constructor = next((each for _, each in found.methods if each.name == "__init__"), None)
+        if constructor and not unknown:
+            takes, needs = _arguments(constructor.args, is_method=True)
+        handlers: dict[str, list[Handler]] = {}  # a method hides those of its name in the bases
+        for each, method in found.methods:
+            marks, why = _marks(each, method)
+            unknown = unknown or why
+            if marks:
+                handlers.setdefault(method.name, marks)
+        for each, statement in found.body:
+            if _makes_methods(statement):
+                why = f"methods of {each.node.name} are made in line {statement.lineno}"
+                unknown = unknown or why
+        return msgspec.structs.replace(
+            found,
             takes=takes,
             needs=needs,
-            handlers=tuple(each for marks in handlers.values() for each in marks),
-            asks=tuple(use for each, method in methods for use in _asks(each, method)),
+            handlers=tuple(itertools.chain.from_iterable(handlers.values())),
             unknown=unknown,
-            declares=any(
-                isinstance(each, ast.Attribute) and each.attr in _DECLARES
-                for _, statement in body
-                for each in ast.walk(statement)
-            ),
-            has_health=any("health" in _binds(statement) for _, statement in body),
-            reads=() if unknown else _reads(body),
-            uncalled=tuple(slip for each, method in methods for slip in _uncalled(each, method)),
-            missing=() if unknown else tuple(self._missing(value)),
         )
 
-    def _missing(self, of: _Definition) -> Iterator[Slip]:
-        """Yield the packages that the top of a module imports, and that are not there."""
+    def missing(self, found: NodeClass) -> Iterator[tuple[str, str]]:
+        """Yield what the top of a class's module imports and is not there: package, `file:line`."""
+        if not found.bases:
+            return
+        of = found.bases[0]
         for statement in dict.fromkeys(itertools.chain(*of.module.bound.values())):
             names: list[str] = []
             if isinstance(statement, ast.Import):
                 names = [each.name for each in statement.names]
             elif isinstance(statement, ast.ImportFrom) and not statement.level:
                 names = [str(statement.module)]
-            for name in dict.fromkeys(each.partition(".")[0] for each in names):
-                if not self._has(name):
-                    yield Slip(name=name, place=of.place(statement))
+            for package in dict.fromkeys(each.partition(".")[0] for each in names):
+                if not self._has(package):
+                    yield package, of.place(statement)
 
     def _has(self, package: str) -> bool:
         try:
             self._locate(package)
         except (NotThereError, UnknownError) as problem:
-            return not problem.message.startswith("cannot find module")
+            return not isinstance(problem, NoModuleError)
         return True
 
-    def _line(self, value: _Definition) -> tuple[list[_Definition], set[str], str]:
+    def _bases(self, value: Definition) -> tuple[tuple[Definition, ...], set[str], str]:
         """Return a class and its bases, the known ones by name, and what is open."""
-        line: list[_Definition] = []
+        found: list[Definition] = []
         known: set[str] = set()
         unknown = ""
         left = [value]
         while left:
             each = left.pop(0)
-            if each in line or not isinstance(each.node, ast.ClassDef):
+            if each in found or not isinstance(each.node, ast.ClassDef):
                 continue
-            line.append(each)
+            found.append(each)
             if each.node.decorator_list or each.node.keywords:
                 unknown = unknown or f"class {each.node.name} has a decorator or a metaclass"
-            above: list[_Definition] = []
+            above: list[Definition] = []
             for base in each.node.bases:
                 try:
-                    found = self._followed(_dotted(each.module, base), 0)
+                    named = self._followed(_dotted(each.module, base), 0)
                 except (NotThereError, UnknownError) as problem:
                     unknown = unknown or f"its base {ast.unparse(base)} is not known: {problem}"
                     continue
-                if isinstance(found, str):
-                    known.add(found)
+                if isinstance(named, str):
+                    known.add(named)
                 else:
-                    above.append(found)
+                    above.append(named)
             left = above + left
-        return line, known, unknown
+        return tuple(found), known, unknown
 
-    def _marks(self, of: _Definition, function: _AnyFunction) -> tuple[list[Use], str]:
-        """Return the handlers that a method is, and why there may be more."""
-        marks: list[Use] = []
-        text = f"{of.node.name}.{function.name}"
-        unknown = f"{text} replaces that of LifecycleNode" if function.name in _ACCESS else ""
-        for decorator in function.decorator_list:
-            called = decorator.func if isinstance(decorator, ast.Call) else decorator
-            shown = ast.unparse(called)
-            dotted = _dotted(of.module, called)
-            if shown.rpartition(".")[2] in _HARMLESS or dotted.startswith("builtins."):
-                continue
-            word = _known(dotted).removeprefix("lifecycle.")
-            name = _literal(of.module, decorator) if word in _HANDLERS else None
-            if name is None:
-                unknown = unknown or f"{text} is decorated with @{shown}"
-                continue
-            handler = Use(
-                kind=_HANDLERS[word],
-                name=name,
-                text=text,
-                place=of.place(function),
-                decides=word == "on_goal",
-            )
-            marks.insert(0, handler)  # the decorator next to the function marks it first
-        return marks, unknown
-
-    def _named(self, module: _Module, name: str, depth: int) -> _Definition | str:
+    def _named(self, module: _Module, name: str, depth: int) -> Definition | str:
         """Return what a name at the top of a module stands for; text for what need not be read.
 
         Raises:
@@ -330,9 +279,9 @@ class Sources:
         if isinstance(only, ast.ImportFrom):
             return self._followed(_dotted(module, ast.Name(name)), depth + 1)
         if isinstance(only, ast.ClassDef) or (
-            isinstance(only, _Function) and not only.decorator_list
+            isinstance(only, Function) and not only.decorator_list
         ):
-            return _Definition(module, only)
+            return Definition(module, only)
         file = _shown(module.file)
         if re.search(rf"\b{re.escape(name)}\b", module.text):
             raise UnknownError(f"{name} is made by running {file}")
@@ -349,7 +298,7 @@ class Sources:
             hint=did_you_mean(name, classes),
         )
 
-    def _followed(self, dotted: str, depth: int) -> _Definition | str:
+    def _followed(self, dotted: str, depth: int) -> Definition | str:
         """Return what a full name stands for, as `_named` does."""
         if known := _known(dotted):
             return known
@@ -383,7 +332,7 @@ class Sources:
                 hint = f"it is looked for in {', '.join(self._folders)} and in what is installed"
                 if inside:
                     hint = f"looked in {', '.join(_shown(Path(each)) for each in paths)}"
-                raise NotThereError(f"cannot find module {so_far!r}", hint=hint)
+                raise NoModuleError(f"cannot find module {so_far!r}", hint=hint)
             found = spec.submodule_search_locations
             origin, paths, inside = spec.origin, found and list(found), so_far
         if origin is None:
@@ -415,18 +364,18 @@ def _read(name: str, file: Path, is_package: bool) -> _Module:
         raise UnknownError(f"{_shown(file)} cannot be read: {problem}") from problem
     module = _Module(name, file, is_package, data.decode("utf-8", "replace"), {})
     for statement in tree.body:
-        for each in _binds(statement):
+        for each in binds(statement):
             module.bound.setdefault(each, []).append(statement)
     return module
 
 
-def _binds(statement: ast.stmt) -> set[str]:
+def binds(statement: ast.stmt) -> set[str]:
     """Return the names that a statement binds, also under conditions inside it."""
-    if isinstance(statement, (ast.ClassDef, *_Function)):
+    if isinstance(statement, (ast.ClassDef, *Function)):
         return {statement.name}
     names = set()
     for each in ast.walk(statement):
-        if isinstance(each, (ast.ClassDef, *_Function)):
+        if isinstance(each, (ast.ClassDef, *Function)):
             names.add(each.name)
         elif isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
             names.add(each.id)
@@ -494,7 +443,7 @@ def _arguments(
     return None if given.kwarg else takes, tuple(each for each in needs if each not in own)
 
 
-def _spins(function: _Definition) -> str:
+def _spins(function: Definition) -> str:
     for node in ast.walk(function.node):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in _OF_HOST:
             return f"{ast.unparse(node.func)} ({function.place(node)})"
@@ -503,11 +452,38 @@ def _spins(function: _Definition) -> str:
 
 def _makes_methods(statement: ast.stmt) -> bool:
     """Whether a statement of a class body makes methods otherwise than by `def`."""
-    return not isinstance(statement, (*_Function, ast.ClassDef)) and any(
-        isinstance(node, (*_Function, ast.Lambda))
+    return not isinstance(statement, (*Function, ast.ClassDef)) and any(
+        isinstance(node, (*Function, ast.Lambda))
         or (isinstance(node, ast.Name) and node.id in _HANDLERS)
         for node in ast.walk(statement)
     )
+
+
+def _marks(of: Definition, function: AnyFunction) -> tuple[list[Handler], str]:
+    """Return the handlers that a method is, and why there may be more."""
+    marks: list[Handler] = []
+    text = f"{of.node.name}.{function.name}"
+    unknown = f"{text} replaces that of LifecycleNode" if function.name in ACCESS else ""
+    for decorator in function.decorator_list:
+        called = decorator.func if isinstance(decorator, ast.Call) else decorator
+        shown = ast.unparse(called)
+        dotted = _dotted(of.module, called)
+        if shown.rpartition(".")[2] in _HARMLESS or dotted.startswith("builtins."):
+            continue
+        word = _known(dotted).removeprefix("lifecycle.")
+        name = _literal(of.module, decorator) if word in _HANDLERS else None
+        if name is None:
+            unknown = unknown or f"{text} is decorated with @{shown}"
+            continue
+        handler = Handler(
+            kind=_HANDLERS[word],
+            name=name,
+            text=text,
+            place=of.place(function),
+            decides=word == "on_goal",
+        )
+        marks.insert(0, handler)  # the decorator next to the function marks it first
+    return marks, unknown
 
 
 def _literal(module: _Module, decorator: ast.expr) -> str | None:
@@ -522,49 +498,6 @@ def _literal(module: _Module, decorator: ast.expr) -> str | None:
             if isinstance(value, ast.Constant) and isinstance(value.value, str):
                 return value.value
     return None
-
-
-def _asks(of: _Definition, function: _AnyFunction) -> Iterator[Use]:
-    for node in ast.walk(function):
-        match node:
-            case ast.Call(
-                func=ast.Attribute(value=ast.Name(id="self"), attr=attr),
-                args=[ast.Constant(value=str(name))],
-            ) if attr in _ACCESS:
-                text = ast.unparse(node)[:80]
-                yield Use(kind=_ACCESS[attr], name=name, text=text, place=of.place(node))
-
-
-def _reads(body: Sequence[tuple[_Definition, ast.stmt]]) -> tuple[Slip, ...]:
-    """Return the parameters that code gets by name; none where it may declare others, too."""
-    gets: list[Slip] = []
-    own: set[str] = set()
-    for of, statement in body:
-        for node in ast.walk(statement):
-            match node:
-                case ast.Call(func=ast.Attribute(attr="declare_parameter"), args=[first, *_]):
-                    if not isinstance(first, ast.Constant):
-                        return ()
-                    own.add(str(first.value))
-                case ast.Attribute(attr="declare_parameters"):
-                    return ()
-                case ast.keyword(arg=str(word)) if "_parameters" in word:
-                    return ()  # allow_undeclared_parameters and its like
-                case ast.Call(
-                    func=ast.Attribute(value=ast.Name(id="self"), attr="get_parameter"),
-                    args=[ast.Constant(value=str(name))],
-                ):
-                    gets.append(Slip(name=name, place=of.place(node)))
-    return tuple(each for each in gets if each.name not in own)
-
-
-def _uncalled(of: _Definition, function: _AnyFunction) -> Iterator[Slip]:
-    name = function.name
-    if not name.startswith("on_") or name in _CALLBACKS or function.decorator_list:
-        return
-    near = difflib.get_close_matches(name, _CALLBACKS, n=1, cutoff=0.85)
-    if near and len(re.findall(rf"\b{name}\b", of.module.text)) == 1:
-        yield Slip(name=f"{of.node.name}.{name}", place=of.place(function), near=near[0])
 
 
 def _shown(file: Path) -> str:

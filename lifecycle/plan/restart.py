@@ -18,8 +18,8 @@ from msgspec.structs import replace
 
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, parse
 from lifecycle.plan.discovery import Hosts, PortPool, contacts_of
+from lifecycle.plan.media import terms_of
 from lifecycle.plan.model import ParticipantConnections, Plan
-from lifecycle.plan.parties import terms_of
 
 RESTART_PORTS_FROM = 2000
 """How far above `first_port` the ports of restarted participants begin: out of the way of ports

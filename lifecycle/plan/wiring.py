@@ -5,16 +5,23 @@ connected, endpoints are negotiated for, observers are extended to see the resul
 endpoint discovery (Fast DDS STATIC EDP) the connection `data` carries a node's topics, and a table
 has all endpoints: DDS names, ids that are unique in the system, and rmw_fastrtps's own topic
 `ros_discovery_info` of each participant.
+
+On Fast DDS a publisher sends from the sender sockets of its participant, so only one of its own
+makes it unique, and only all publishers of one participant together can carry a DSCP. From the same
+sockets subscriptions send their acknowledgements.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error
+from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
+    ConnectionDeclaration,
     DataLayerSource,
     DiscoveryMode,
     EndpointKind,
@@ -34,7 +41,17 @@ from lifecycle.plan.discovery import (
     meshed,
     with_tcp,
 )
-from lifecycle.plan.media import carried
+from lifecycle.plan.media import (
+    DataLayerGraph,
+    NegotiatedConnection,
+    Party,
+    carried,
+    party_of_node,
+    rmw_of,
+    terms_of,
+    wishes_of,
+    written_ports,
+)
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
@@ -50,20 +67,135 @@ from lifecycle.plan.model import (
     StaticParticipant,
 )
 from lifecycle.plan.negotiate import negotiate
-from lifecycle.plan.participants import participant_name, place_negotiated
-from lifecycle.plan.parties import (
-    DataLayerGraph,
-    NegotiatedConnection,
-    NegotiatedFlow,
-    Party,
-    party_of_node,
-    rmw_of,
-    terms_of,
-    wishes_of,
-    written_ports,
-)
 from lifecycle.plan.processes import variables_of
 from lifecycle.printable import count
+
+
+def participant_name(node_name: str, connection: str) -> str:
+    """Return the base name of the hidden node that carries a connection, `_camera_net`."""
+    return f"_{node_name}_{connection}"
+
+
+def place(
+    node_name: str,
+    endpoints: Sequence[PlannedEndpoint],
+    connections: Sequence[ConnectionDeclaration],
+    groups: Sequence[ParticipantGroup],
+) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
+    """Put endpoints on the connections that are declared for them, the others on what flows need.
+
+    Names of the latter count from 0 in the order in which the interface first needs them, so they
+    are the same in every run. What is in no connection and no group is left alone. Returns the
+    endpoints with `participant` filled in, and the participants, connections first.
+    """
+    places = {
+        entry: participant_name(node_name, connection.name)
+        for connection in connections
+        for entry in connection.map
+    }
+    participants = [_connection(node_name, connection, groups) for connection in connections]
+    for group in groups:
+        names = tuple(name for name in group.names if (group.kind, name) not in places)
+        if names:
+            flow = participant_name(node_name, f"flow_{len(participants) - len(connections)}")
+            places |= {(group.kind, name): flow for name in names}
+            participants.append(
+                PlannedParticipant(
+                    name=flow,
+                    reason=_reason(replace(group, names=names)),
+                    transports=group.transports,
+                    **_asked([group]),
+                )
+            )
+    placed = tuple(
+        replace(each, participant=places.get((each.kind, each.name), "")) for each in endpoints
+    )
+    return placed, tuple(participants)
+
+
+def _asked(
+    needs: Sequence[ParticipantGroup] | Sequence[PlannedParticipant],
+    marks: Sequence[int | None] = (),
+) -> dict[str, Any]:
+    """Return what a participant must do for all that it carries; it can have one mark."""
+    dscps = (*marks, *(each.dscp for each in needs))
+    sizes = [each.max_datagram_bytes for each in needs if each.max_datagram_bytes is not None]
+    return {
+        "dscp": next((each for each in dscps if each is not None), None),
+        "max_datagram_bytes": min(sizes, default=None),
+        "non_blocking_send": any(each.non_blocking_send for each in needs),
+    }
+
+
+def _connection(
+    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
+) -> PlannedParticipant:
+    """Return the participant of a connection, with what the flows of its endpoints ask for."""
+    needs = [
+        group
+        for group in groups
+        if {*connection.map} & {(group.kind, name) for name in group.names}
+    ]
+    return PlannedParticipant(
+        name=participant_name(node_name, connection.name),
+        reason=f"connection {connection.name} for {count(len(connection.map), 'endpoint')}",
+        connection=connection.name,
+        connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
+        declared=True,
+        **_asked(needs, [url.dscp for url in connection.urls]),
+    )
+
+
+def _reason(group: ParticipantGroup) -> str:
+    noun = f"{group.kind.noun}{'s' if len(group.names) > 1 else ''}"
+    facts = [f"{'unique ' if group.unique else ''}{noun} {', '.join(group.names)}"]
+    if group.dscp is not None:
+        facts.append(f"marked {describe(group.dscp)}")
+    if group.five_qi is not None:
+        facts.append(f"for 5QI {group.five_qi}")
+    if group.transports:
+        facts.append(f"by {' and '.join(group.transports)} only")
+    if group.max_datagram_bytes is not None:
+        facts.append(f"in datagrams of at most {group.max_datagram_bytes} bytes")
+    if group.non_blocking_send:
+        facts.append("sent without waiting")
+    return " ".join(facts)
+
+
+def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:
+    """Give a node the connections that were negotiated for it.
+
+    An extra participant that made a publisher's flow unique and carries none any more is removed;
+    the publisher's connection takes its purpose.
+    """
+    places = {label: each for each in connections for label in each.map}
+    endpoints = []
+    carriers = {each.name: each for each in node.participants}
+    takes: dict[str, list[PlannedParticipant]] = {}
+    for each in node.endpoints:
+        connection = places.get(each.kind.spell(each.name))
+        if connection is None:
+            endpoints.append(each)
+            continue
+        if each.participant in carriers:
+            takes.setdefault(connection.name, []).append(carriers[each.participant])
+        name = participant_name(node.name, connection.name)
+        endpoints.append(replace(each, participant=name))
+    used = {each.participant for each in endpoints}
+    kept = [each for each in node.participants if each.connection or each.name in used]
+    for connection in connections:
+        replaced = takes.get(connection.name, [])
+        reason = f"connection {connection.name}, {connection.reason}"
+        made = PlannedParticipant(
+            name=participant_name(node.name, connection.name),
+            reason="; ".join([reason, *dict.fromkeys(each.reason for each in replaced)]),
+            connection=connection.name,
+            connections=ParticipantConnections(urls=connection.urls),
+            **_asked(replaced),
+        )
+        kept.append(made)
+    return replace(node, endpoints=tuple(endpoints), participants=tuple(kept))
+
 
 _End = tuple[PlannedNode, PlannedEndpoint]
 
@@ -192,17 +324,16 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
     connections: dict[str, list[NegotiatedConnection]] = {}
     for each in graph.connections:
         connections.setdefault(each.node, []).append(each)
-    negotiated: dict[tuple[str, str, str], list[NegotiatedFlow]] = {}
-    for flow in graph.flows:
-        place = (flow.topic, flow.publisher, flow.subscription)
-        negotiated.setdefault(place, []).append(flow)
+    negotiated = {(each.topic, each.publisher, each.subscription): each for each in graph.flows}
+
+    def with_medium(flow: PlannedFlow) -> PlannedFlow:
+        found = negotiated.get((flow.topic, flow.publisher, flow.subscription))
+        return replace(flow, medium=found.medium, medium_reason=found.reason) if found else flow
+
     return replace(
         plan,
         nodes=tuple(place_negotiated(node, connections.get(node.key, ())) for node in plan.nodes),
-        flows=tuple(
-            _with_medium(flow, negotiated.get((flow.topic, flow.publisher, flow.subscription), ()))
-            for flow in plan.flows
-        ),
+        flows=tuple(map(with_medium, plan.flows)),
     )
 
 
@@ -248,14 +379,6 @@ def _unconnectable(
         yield error("plan.unconnectable", at, problem.problem, problem.hint)
 
 
-def _with_medium(flow: PlannedFlow, found: Sequence[NegotiatedFlow]) -> PlannedFlow:
-    if not found:
-        return flow
-    media = dict.fromkeys(each.medium for each in found)
-    reasons = dict.fromkeys(each.reason for each in found)
-    return replace(flow, medium=" and ".join(media), medium_reason=", ".join(reasons))
-
-
 DATA = "data"
 """Name of the connection that carries a node's topics."""
 
@@ -278,7 +401,7 @@ def place_static(
         for each in node.participants
         if _is_static(each)
     }
-    urls = meshed(ports, kind, hosts)
+    urls = meshed(ports, kind)
     table = tuple(_table(placed))
 
     def connected(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:

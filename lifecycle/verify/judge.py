@@ -82,25 +82,23 @@ def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
 
 
 def _reported(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
-    ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
+    ends = (uniqueness.is_unique(flow.writer), uniqueness.is_unique(flow.reader))
     carrier = effective_transport(flow)
     return FlowReport(
         topic=flow.planned.topic,
         publisher=flow.publisher,
         subscription=flow.subscription,
-        source=_used(uniqueness.nfes(flow.publishers), carrier),
-        destination=_used(uniqueness.nfes(flow.subscriptions), carrier),
+        source=_used(uniqueness.nfes(flow.writer), carrier),
+        destination=_used(uniqueness.nfes(flow.reader), carrier),
         unique=None if None in ends else _HOW[ends.count(True)],
-        dscp=_dscp(flow.publishers, carrier),
-        reader_dscp=_dscp(flow.subscriptions, carrier),
+        dscp=_dscp(flow.writer, carrier),
+        reader_dscp=_dscp(flow.reader, carrier),
         requirement=flow.requirement,
         demanded=flow.planned.unique,
         outcome=_outcome(flow, spoiled),
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
-        five_qi_reason="; ".join(
-            dict.fromkeys(filter(None, (end.planned.five_qi_reason for end in flow.publishers)))
-        ),
+        five_qi_reason=flow.writer.planned.five_qi_reason if flow.writer else "",
         effective_transport=carrier,
     )
 
@@ -115,15 +113,14 @@ def _used(nfes: tuple[NetworkFlowEndpoint, ...], carrier: str) -> tuple[NetworkF
     return tuple(each for each in nfes if each.transport_protocol is not other)
 
 
-def _dscp(ends: Sequence[Actual], carrier: str) -> int | None:
-    """The DSCP that was read back; None if none was, or several endpoints differ.
+def _dscp(end: Actual | None, carrier: str) -> int | None:
+    """The DSCP that was read back; None if none was.
 
     Only UDP sockets are marked and read: of a connection that has both, TCP does not carry it.
     """
-    if _OTHER_PROTOCOL.get(carrier) is TransportProtocol.UDP:
+    if end is None or end.report is None:
         return None
-    read = {end.report.dscp if end.report else None for end in ends}
-    return read.pop() if len(read) == 1 else None
+    return None if _OTHER_PROTOCOL.get(carrier) is TransportProtocol.UDP else end.report.dscp
 
 
 def verify(

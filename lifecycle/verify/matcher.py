@@ -50,11 +50,6 @@ _Left = dict[tuple[EndpointKind, str, bool], list[EndpointReport]]
 """Reports that are of no declared endpoint yet: by kind and declared name, or by kind and resolved
 name of those that have no other; each report is of one declared endpoint."""
 
-_TURNS = ((True, True), (True, False), (False, False))
-"""Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
-whose node reports it so, the rest. So one wrong type does not take another one's place. Each says
-whether the report, and what discovery shows, must have the declared type."""
-
 
 def lay_out(
     plan: Plan,
@@ -90,7 +85,6 @@ def lay_out(
             configuration=configuration,
             parameters=parameters.get(name),
             actual=tuple(matched),
-            ends=_by_place(matched),
             absent=name not in observed and all(each.observed is None for each in matched),
         )
         # A second node of the same name has the same endpoints again; that is one finding.
@@ -122,7 +116,7 @@ def lay_out(
         departed=tuple(
             replace(SeenEndpoint.of(each), has_ended=True) for each in observation.departed
         ),
-        flows=_flows(plan, nodes),
+        flows=_flows(plan, nodes, actual),
         uniqueness=Uniqueness(
             reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
         ),
@@ -229,13 +223,6 @@ def _tools(
     return {name: pattern for name, pattern in found.items() if pattern}
 
 
-def _by_place(matched: Iterable[Actual]) -> dict[tuple[EndpointKind, str], tuple[Actual, ...]]:
-    ends: dict[tuple[EndpointKind, str], tuple[Actual, ...]] = {}
-    for each in matched:
-        ends[each.kind, each.name] = (*ends.get((each.kind, each.name), ()), each)
-    return ends
-
-
 def _topical(endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
     return (each for each in endpoints if each.kind.is_topic)
 
@@ -255,31 +242,26 @@ def _match_node(
     for each in endpoints:
         pools.setdefault(_place(each), []).append(each)
     places = pools.keys()
-    matched: dict[int, Actual] = {}
+    matched: list[Actual] = []
     used: set[tuple[EndpointKind, str]] = set()
-    for exact_report, exact_observed in _TURNS:
-        for index, planned in enumerate(node.endpoints):
-            if index in matched:
-                continue
-            place = (planned.kind, planned.resolved)
-            report = _pick_report(planned, reports, exact=exact_report)
-            observed = _pick_observed(planned, report, pools.get(place, []), exact=exact_observed)
-            if exact_report and (observed if exact_observed else report) is None:
-                continue  # its turn comes
-            unseen = observed is None and may_hide(node, planned)
-            if observed is not None and observed.gid:
-                pools[place].remove(observed)
-            elif observed is not None:
-                used.add(place)  # found by name only: it represents any number of them
-            elif unseen and report is not None and report.resolved == planned.resolved:
-                observed = _as_observed(node, report) if _is_there(report) else None
-            if report is not None:
-                reports[_left_key(report)].remove(report)
-            matched[index] = _actual(node, planned, observed, report, unseen=unseen, beyond=beyond)
+    for planned in node.endpoints:
+        place = (planned.kind, planned.resolved)
+        report = _pick_report(planned, reports)
+        observed = _pick_observed(planned, report, pools.get(place, ()))
+        unseen = observed is None and may_hide(node, planned)
+        if observed is not None and observed.gid:
+            pools[place].remove(observed)
+        elif observed is not None:
+            used.add(place)  # found by name only: it represents any number of them
+        elif unseen and report is not None and report.resolved == planned.resolved:
+            observed = _as_observed(node, report) if _is_there(report) else None
+        if report is not None:
+            reports[_left_key(report)].remove(report)
+        matched.append(_actual(node, planned, observed, report, unseen=unseen, beyond=beyond))
     rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
     rest += [
         _as_observed(node, actual.report)
-        for actual in matched.values()
+        for actual in matched
         if actual.report is not None
         and actual.report.resolved != actual.planned.resolved
         and _is_there(actual.report)
@@ -294,18 +276,16 @@ def _match_node(
             report.kind, node.full_name, report.resolved, report.type, ours=True
         )
     ]
-    return [matched[index] for index in range(len(node.endpoints))], rest
+    return matched, rest
 
 
-def _pick_report(planned: PlannedEndpoint, left: _Left, *, exact: bool) -> EndpointReport | None:
+def _pick_report(planned: PlannedEndpoint, left: _Left) -> EndpointReport | None:
     """Choose the report on a declared endpoint: by its declared name, else its resolved one."""
     named = left.get((planned.kind, planned.name, True))
     if named:
         return named[0]
-    for each in left.get((planned.kind, planned.resolved, False), ()):
-        if each.type == planned.type or not exact:
-            return each
-    return None
+    nameless = left.get((planned.kind, planned.resolved, False), ())
+    return min(nameless, key=lambda each: each.type != planned.type, default=None)
 
 
 def _left_key(report: EndpointReport) -> tuple[EndpointKind, str, bool]:
@@ -316,18 +296,14 @@ def _pick_observed(
     planned: PlannedEndpoint,
     report: EndpointReport | None,
     pool: Sequence[ObservedEndpoint],
-    *,
-    exact: bool,
 ) -> ObservedEndpoint | None:
     """Choose what discovery shows of a declared endpoint: by GID, else by type, else any."""
-    if report is not None and report.gid:
-        for endpoint in pool:
-            if endpoint.gid == report.gid:
-                return endpoint
-    for endpoint in pool:
-        if endpoint.type == planned.type or not exact:
-            return endpoint
-    return None
+    gid = report.gid if report is not None else ""
+    return min(
+        pool,
+        key=lambda each: (not gid or each.gid != gid, each.type != planned.type),
+        default=None,
+    )
 
 
 def _is_there(report: EndpointReport) -> bool:
@@ -444,20 +420,20 @@ def _seen(
     return tuple(found)
 
 
-def _flows(plan: Plan, nodes: Mapping[str, NodeFacts]) -> tuple[FlowView, ...]:
-    by_key = {node.key: nodes[node.full_name] for node in reversed(plan.nodes)}
+def _flows(
+    plan: Plan, nodes: Mapping[str, NodeFacts], actual: Sequence[Actual]
+) -> tuple[FlowView, ...]:
+    by_key = {facts.node.key: facts for facts in nodes.values()}
+    ends = {(each.node, each.kind, each.name): each for each in reversed(actual)}
     found = []
     for planned in plan.flows:
         source, destination = by_key[planned.publisher], by_key[planned.subscription]
-        publishers = source.ends.get((EndpointKind.PUBLISHER, planned.topic), ())
-        subscriptions = destination.ends.get((EndpointKind.SUBSCRIPTION, planned.topic), ())
         flow = FlowView(
             planned=planned,
             publisher=source.name,
             subscription=destination.name,
-            publishers=publishers,
-            subscriptions=subscriptions,
-            at=next((each.planned.at for each in (*subscriptions, *publishers)), None),
+            writer=ends.get((source.name, EndpointKind.PUBLISHER, planned.topic)),
+            reader=ends.get((destination.name, EndpointKind.SUBSCRIPTION, planned.topic)),
             nodes=(source, destination),
         )
         found.append(flow)

@@ -113,15 +113,18 @@ class Uniqueness:
                         self._buckets.setdefault(_bucket(entry.kind, each), Counter())[each] += 1
         self._answers = {each: self._judge(entry) for each, entry in self._entries.items()}
 
-    def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
-        """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
-        places = (_place(end.node, end.report) for end in ends if end.report)
-        entries = (self._entries[each] for each in places if each in self._entries)
-        return tuple(dict.fromkeys(each.nfe for entry in entries for each in entry.nfes or ()))
+    def nfes(self, end: Actual | None) -> tuple[NetworkFlowEndpoint, ...]:
+        """Return the NFEs of an endpoint, each once, with the DSCP that was read back."""
+        if end is None or end.report is None:
+            return ()
+        entry = self._entries.get(_place(end.node, end.report))
+        return tuple(dict.fromkeys(each.nfe for each in (entry.nfes if entry else None) or ()))
 
-    def is_unique(self, end: Actual) -> bool | None:
+    def is_unique(self, end: Actual | None) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
-        return self._answers.get(_place(end.node, end.report)) if end.report else None
+        if end is None or end.report is None:
+            return None
+        return self._answers.get(_place(end.node, end.report))
 
     def _judge(self, entry: _Entry) -> bool | None:
         if entry.judged is None:
@@ -134,13 +137,6 @@ class Uniqueness:
         if not own:
             return False  # the network sees nothing of it
         return None if (entry.kind, entry.process) in self._unknown else True
-
-    def all_unique(self, ends: Sequence[Actual]) -> bool | None:
-        """Return whether each of several endpoints is unique; False if one is certainly not."""
-        answers = [self.is_unique(end) for end in ends]
-        if False in answers:
-            return False
-        return None if None in answers or not answers else True
 
 
 def meets(demanded: UniqueHow, *, publisher: bool | None, subscription: bool | None) -> bool | None:
@@ -193,41 +189,40 @@ def effective_transport(flow: FlowView) -> str:
     """Return what carries a planned flow, as `carrier` says."""
     source, destination = (each.configuration for each in flow.nodes)
     return carrier(
-        _ways(source, flow.publishers),
-        _ways(destination, flow.subscriptions),
+        _ways(source, flow.writer),
+        _ways(destination, flow.reader),
         None if source is None else source.identity,
         None if destination is None else destination.identity,
     )
 
 
 def _ways(
-    configuration: NodeConfiguration | None, ends: Sequence[Actual]
+    configuration: NodeConfiguration | None, end: Actual | None
 ) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of one side, and what it was connected to where they do not show it.
 
     rmw_fastrtps lists no NFE of a TCP transport at a publisher.
     """
-    connections = (
-        {each.name: each.urls for each in configuration.connections} if configuration else {}
+    report = None if end is None else end.report
+    if configuration is None or report is None or report.nfes is None:
+        return ()
+    listed = {each.transport_protocol for each in report.nfes}
+    connected = (
+        _as_nfe(url)
+        for each in configuration.connections
+        if report.mapped and each.name == report.connection
+        for url in each.urls
     )
-    found: list[NetworkFlowEndpoint] = []
-    for end in ends:
-        if end.report is None or end.report.nfes is None:
-            continue
-        found += end.report.nfes
-        listed = {each.transport_protocol for each in end.report.nfes}
-        urls = connections.get(end.report.connection, ()) if end.report.mapped else ()
-        found += [
+    tcp = TransportProtocol.TCP
+    return (
+        *report.nfes,
+        *(
             each
-            for each in map(_as_nfe, urls)
+            for each in connected
             if each is not None
-            and (not listed or (_is_tcp(each) and TransportProtocol.TCP not in listed))
-        ]
-    return tuple(found)
-
-
-def _is_tcp(nfe: NetworkFlowEndpoint) -> bool:
-    return nfe.transport_protocol is TransportProtocol.TCP
+            and (not listed or (each.transport_protocol is tcp and tcp not in listed))
+        ),
+    )
 
 
 def _as_nfe(text: str) -> NetworkFlowEndpoint | None:

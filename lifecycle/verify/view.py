@@ -6,7 +6,7 @@ fills it, anew for each verdict. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import msgspec
 from msgspec.structs import replace
@@ -35,13 +35,6 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.tool_filter import DeclaredNames
 from lifecycle.verify.verdict import Stage
-
-_BY_STRENGTH = (
-    UniqueRequirement.STRICTLY_REQUIRED,
-    UniqueRequirement.OPTIONALLY_REQUIRED,
-    UniqueRequirement.SYSTEM_DEFAULT,
-    UniqueRequirement.NOT_REQUIRED,
-)
 
 
 class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,7 +116,6 @@ class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         configuration: what it reports; None if it reports nothing.
         parameters: what its parameter services returned; None if they were not asked.
         actual: its declared endpoints.
-        ends: the same by kind and name.
         absent: nothing at all is seen of it: then one finding says it all.
     """
 
@@ -132,7 +124,6 @@ class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     configuration: NodeConfiguration | None
     parameters: NodeParameters | None
     actual: tuple[Actual, ...]
-    ends: Mapping[tuple[EndpointKind, str], tuple[Actual, ...]]
     absent: bool
 
     @property
@@ -157,18 +148,16 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     Attributes:
         publisher: fully qualified name of the publishing node.
         subscription: fully qualified name of the subscribing node.
-        publishers: the publishing node's declared publishers of the topic; usually one.
-        subscriptions: likewise.
-        at: the subscription's declaration, else the publisher's.
+        writer: the declared publisher; None where the node that a link names declares none.
+        reader: the declared subscription, likewise.
         nodes: what is known of the two nodes.
     """
 
     planned: PlannedFlow
     publisher: str
     subscription: str
-    publishers: tuple[Actual, ...]
-    subscriptions: tuple[Actual, ...]
-    at: Position | None
+    writer: Actual | None
+    reader: Actual | None
     nodes: tuple[NodeFacts, NodeFacts]
 
     @property
@@ -183,24 +172,28 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @property
     def endpoints(self) -> tuple[Actual, ...]:
-        """The declared publishers and subscriptions of both nodes."""
-        return (*self.publishers, *self.subscriptions)
+        """The declared publisher and subscription."""
+        return tuple(each for each in (self.writer, self.reader) if each is not None)
+
+    @property
+    def at(self) -> Position | None:
+        """Where its subscription is declared, else its publisher."""
+        end = self.reader or self.writer
+        return None if end is None else end.at
 
     @property
     def requirement(self) -> tuple[UniqueRequirement, UniqueRequirement]:
-        """The strongest requirement of each end: several endpoints of a node are one end."""
-        return _strongest(self.publishers), _strongest(self.subscriptions)
+        """What each end requires."""
+        none = UniqueRequirement.NOT_REQUIRED
+        return (
+            self.writer.planned.unique if self.writer else none,
+            self.reader.planned.unique if self.reader else none,
+        )
 
     @property
     def five_qi(self) -> int | None:
-        """The planned 5QI; None if none is, or several publishers differ."""
-        declared = {end.planned.five_qi for end in self.publishers}
-        return declared.pop() if len(declared) == 1 else None
-
-
-def _strongest(ends: Iterable[Actual]) -> UniqueRequirement:
-    asked = {end.planned.unique for end in ends} or {UniqueRequirement.NOT_REQUIRED}
-    return next(each for each in _BY_STRENGTH if each in asked)
+        """The planned 5QI; None if none is."""
+        return self.writer.planned.five_qi if self.writer else None
 
 
 class View(msgspec.Struct, frozen=True, kw_only=True):

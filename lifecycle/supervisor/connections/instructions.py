@@ -25,6 +25,15 @@ from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.discovery import Hosts, contacts_of, ports_of
+from lifecycle.plan.media import (
+    DataLayerGraph,
+    NegotiatedConnection,
+    Party,
+    party_of_node,
+    terms_of,
+    transports_of,
+    wishes_of,
+)
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -34,17 +43,7 @@ from lifecycle.plan.model import (
     PlannedParticipant,
 )
 from lifecycle.plan.negotiate import negotiate
-from lifecycle.plan.participants import participant_name
-from lifecycle.plan.parties import (
-    DataLayerGraph,
-    NegotiatedConnection,
-    Party,
-    party_of_node,
-    terms_of,
-    transports_of,
-    wishes_of,
-)
-from lifecycle.plan.wiring import with_graph
+from lifecycle.plan.wiring import participant_name, with_graph
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import NOT_WIRED, node_of

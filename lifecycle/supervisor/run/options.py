@@ -18,8 +18,8 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Machine, Manifest
 from lifecycle.network.connection_url import Peer, parse
+from lifecycle.plan.media import urls_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
-from lifecycle.plan.parties import urls_of
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Verdict
 from lifecycle.verify.view import only_shared_memory

@@ -199,7 +199,7 @@ def check(view: View) -> Iterator[Finding]:
         if flow.planned.unique is not UniqueHow.NOT:
             yield from _demanded(flow, view.uniqueness)
     for flow in view.flows:
-        if flow.publishers and flow.subscriptions and not is_missing(flow):
+        if flow.writer and flow.reader and not is_missing(flow):
             yield from _judge_transport(view, flow)
     for actual in view.actual:
         if actual.observed is not None or actual.report is not None:
@@ -241,7 +241,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
             f" is not proven: {_why_unproven(actual)}",
         )
     elif unique is False:
-        shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes((actual,)))))
+        shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes(actual))))
         yield NOT_UNIQUE.on(
             actual,
             expected=f"unique {word}",
@@ -252,13 +252,11 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
 
 
 def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
-    if not flow.publishers or not flow.subscriptions:
+    if not flow.writer or not flow.reader or is_missing(flow):
         return  # the link is unmatched, and says so
-    if is_missing(flow):
-        return
     how = flow.planned.unique.value
-    publisher = uniqueness.all_unique(flow.publishers)
-    subscription = uniqueness.all_unique(flow.subscriptions)
+    publisher = uniqueness.is_unique(flow.writer)
+    subscription = uniqueness.is_unique(flow.reader)
     met = meets(flow.planned.unique, publisher=publisher, subscription=subscription)
     if met:
         return

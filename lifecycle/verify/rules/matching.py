@@ -215,31 +215,24 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
 
 def _cause(flow: FlowView) -> str:
     """Return why the two ends cannot match at all; empty if they can."""
-    for word, node, ends in (
-        ("publisher", flow.publisher, flow.publishers),
-        ("subscription", flow.subscription, flow.subscriptions),
+    for word, node, end in (
+        ("publisher", flow.publisher, flow.writer),
+        ("subscription", flow.subscription, flow.reader),
     ):
-        if not ends:
+        if end is None:
             return f"{node} declares no {word} of it"
-        if any(end.observed is None and not end.beyond for end in ends):
+        if end.observed is None and not end.beyond:
             return f"the {word} is missing"
-    for publisher in flow.publishers:
-        for subscription in flow.subscriptions:
-            if cause := obstacle(publisher, subscription):
-                return cause
-    return ""
+    return obstacle(*flow.endpoints)
 
 
 def _judge(flow: FlowView, ends: _Ends) -> Match:
-    """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
-    answers = [
-        match(publisher, subscription, *ends)
-        for publisher in flow.publishers
-        for subscription in flow.subscriptions
-    ]
-    if flow.planned.linked and None in answers:
-        return Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"
-    return _worst(each for each in answers if each is not None)
+    """Return what is known of a flow of which both ends are seen."""
+    writer, reader = flow.endpoints
+    if answer := match(writer, reader, *ends):
+        return answer
+    unknown = Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"
+    return unknown if flow.planned.linked else _OK
 
 
 def _worst(answers: Iterable[Match]) -> Match:

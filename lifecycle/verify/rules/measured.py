@@ -272,22 +272,23 @@ def _marks(view: View) -> Iterator[Finding]:
         publisher, subscriber = (each.node for each in flow.nodes)
         if not brings_up(subscriber, view.machines) or not _differ(flow):
             continue
-        asked = (each.planned.dscp for each in flow.publishers)
-        for dscp in {each: None for each in asked if each is not None}:
-            arrives_as = view.marks.get((publisher.machine, dscp), dscp)
-            if arrives_as == dscp:
-                continue  # or it is too early
-            known = arrives_as is not None
-            observed = "nothing" if arrives_as is None else describe(arrives_as)
-            what = f"what {publisher.machine} sends as {describe(dscp)} beside the flow"
-            yield DSCP_LOST.on(
-                flow,
-                outcome=Outcome.VIOLATED if known else Outcome.UNVERIFIABLE,
-                expected=describe(dscp),
-                observed=observed,
-                message=f"{what} {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-                + (f" arrives as {observed}" if known else " does not arrive"),
-            )
+        dscp = flow.writer.planned.dscp if flow.writer else None
+        if dscp is None:
+            continue
+        arrives_as = view.marks.get((publisher.machine, dscp), dscp)
+        if arrives_as == dscp:
+            continue  # or it is too early
+        known = arrives_as is not None
+        observed = "nothing" if arrives_as is None else describe(arrives_as)
+        what = f"what {publisher.machine} sends as {describe(dscp)} beside the flow"
+        yield DSCP_LOST.on(
+            flow,
+            outcome=Outcome.VIOLATED if known else Outcome.UNVERIFIABLE,
+            expected=describe(dscp),
+            observed=observed,
+            message=f"{what} {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+            + (f" arrives as {observed}" if known else " does not arrive"),
+        )
 
 
 def measurements(view: View) -> tuple[FlowMeasurement, ...]:
@@ -409,9 +410,8 @@ def _counted(view: View) -> list[_Counted]:
     seen = (*view.seen, *view.seen_of_tools)
     publishers = Counter(each.name for each in seen if each.kind is EndpointKind.PUBLISHER)
     for (topic, _), flows in arriving.items():
-        planned = sum(len(each.publishers) or 1 for each in flows)
-        of_topic = (each for one in flows[0].subscriptions for each in one.planned.quantities)
-        numbers = tuple(of_topic)
+        reader = flows[0].reader
+        numbers = reader.planned.quantities if reader else ()
         sample = _sample(view, flows[0])
         there = [each for each in flows if not is_missing(each)]
         active = [each for each in there if _is_active(view, each)]
@@ -419,11 +419,11 @@ def _counted(view: View) -> list[_Counted]:
         publish_s = tuple(each for each in times if each is not None)
         judging = (active or there or flows)[0]
         for flow in there:
-            published = (each for one in flow.publishers for each in one.planned.quantities)
+            published = flow.writer.planned.quantities if flow.writer else ()
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max(planned, publishers[topic]),
+                several=max(len(flows), publishers[topic]),
                 publish_s=() if None in times else publish_s,
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),

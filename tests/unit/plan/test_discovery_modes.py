@@ -18,8 +18,8 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.plan.build import build_plan
+from lifecycle.plan.media import terms_of
 from lifecycle.plan.model import Plan, PlanError
-from lifecycle.plan.parties import terms_of
 from tests.builders import at, link, manifest, node, planned, publisher, subscription
 
 TWO = (

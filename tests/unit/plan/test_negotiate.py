@@ -14,9 +14,9 @@ from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.discovery import Contact
+from lifecycle.plan.media import DataLayerGraph, Party, Terms, transports_of
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedParticipant
 from lifecycle.plan.negotiate import negotiate
-from lifecycle.plan.parties import DataLayerGraph, Party, Terms, transports_of
 from tests.builders import at
 
 STRING = "std_msgs/msg/String"

@@ -29,14 +29,14 @@ from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.discovery import Hosts
-from lifecycle.plan.model import Plan
-from lifecycle.plan.negotiate import negotiate
-from lifecycle.plan.parties import (
+from lifecycle.plan.media import (
     DataLayerGraph,
     party_of_node,
     terms_of,
     wishes_of,
 )
+from lifecycle.plan.model import Plan
+from lifecycle.plan.negotiate import negotiate
 from lifecycle.supervisor.connections.instructions import (
     Instructions,
     NegotiatedSource,

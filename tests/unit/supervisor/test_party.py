@@ -12,13 +12,13 @@ from lifecycle.network.connection_url import Peer
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.discovery import Contact
+from lifecycle.plan.media import Party
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedEndpoint,
     PlannedNode,
     PlannedParticipant,
 )
-from lifecycle.plan.parties import Party
 from lifecycle.supervisor.connections.instructions import party_of
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport

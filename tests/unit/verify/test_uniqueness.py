@@ -111,45 +111,16 @@ def test_the_mark_that_was_read_back_tells_publishers_apart(marks, expected):
 
 
 def test_the_sockets_of_endpoints_are_each_named_once_with_the_mark_that_was_read_back():
-    plan = planned(node("one", publisher("a"), publisher("b"), subscription("c")))
+    plan = planned(node("one", publisher("a"), subscription("c")))
     edit = both(
-        change_report(PUB, "/a", nfes=(SHM, nfe(1)), dscp=46),
-        change_report(PUB, "/b", nfes=(nfe(1), nfe(2)), dscp=46),
+        change_report(PUB, "/a", nfes=(SHM, nfe(1), nfe(1)), dscp=46),
         change_report(SUB, "/c", nfes=(nfe(3),), dscp=46),
     )
     uniqueness, ends = laid_out(plan, edit)
-    marked = uniqueness.nfes((ends["/a"], ends["/b"]))
-    assert [(each.transport_port, each.dscp) for each in marked] == [(1, 46), (1, 46), (2, 46)]
-    assert uniqueness.nfes((ends["/c"],)) == (nfe(3),)
-    assert uniqueness.nfes(()) == ()
-
-
-@pytest.mark.parametrize(
-    ("nfes", "expected"),
-    [
-        ({"a": (nfe(1),), "b": (nfe(2),)}, True),
-        ({"a": (nfe(1),), "b": (nfe(9),)}, False),
-        ({"a": (nfe(1),), "b": None}, None),
-        ({"a": None, "b": (nfe(9),)}, False),
-    ],
-)
-def test_several_endpoints_are_unique_if_each_is_and_not_if_one_is_not(nfes, expected):
-    plan = planned(
-        node("one", publisher("a")), node("two", publisher("b")), node("three", publisher("c"))
-    )
-    edit = both(
-        *(
-            change_configuration(
-                name, identity=Identity(machine_id="m", process_id=number, node_id=name)
-            )
-            for number, name in enumerate(("/one", "/two", "/three"))
-        ),
-        lists(PUB, c=(nfe(9),), **nfes),
-    )
-    uniqueness, ends = laid_out(plan, edit)
-    assert uniqueness.all_unique((ends["/a"], ends["/b"])) is expected
-    assert uniqueness.all_unique((ends["/b"], ends["/a"])) is expected
-    assert uniqueness.all_unique(()) is None
+    marked = uniqueness.nfes(ends["/a"])
+    assert [(each.transport_port, each.dscp) for each in marked] == [(1, 46), (1, 46)]
+    assert uniqueness.nfes(ends["/c"]) == (nfe(3),)
+    assert uniqueness.nfes(None) == ()
 
 
 # --- declared addresses of machines

@@ -72,25 +72,6 @@ def test_the_dscp_of_a_flow_is_what_was_read_and_not_what_was_planned():
     assert {each.dscp for each in video.source} == {0}
 
 
-def two_on_one_topic(*dscps: int | None) -> Plan:
-    """A node whose two publishers of one topic are marked so, and one that takes both."""
-    names = ("a", "/a")
-    return planned(
-        node(
-            "one",
-            *map(publisher, names),
-            needs=[need(PUB, name, dscp=dscp) for name, dscp in zip(names, dscps, strict=True)],
-        ),
-        node("two", subscription("a")),
-    )
-
-
-@pytest.mark.parametrize(("marks", "shown"), [((46, 46), 46), ((46, 8), None), ((8, 46), None)])
-def test_of_publishers_that_differ_no_dscp_is_shown_for_all(marks, shown):
-    (flow,) = flows_after(unchanged, two_on_one_topic(*marks))
-    assert flow.dscp == shown
-
-
 MARKED_READER = planned(
     node("one", publisher("a"), needs=[need(PUB, "a", dscp=46)]),
     node("two", subscription("a"), needs=[need(SUB, "a", dscp=48)]),
