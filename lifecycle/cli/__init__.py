@@ -265,7 +265,7 @@ def program() -> int:
         return main()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    code = own_streams(waits=verb != ["up"]).settled(main())
+    code = own_streams(waits=verb != ["up"])(main())
     if verb == ["up"]:
         # The interpreter takes a moment to end, and the reported result of the run is final.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

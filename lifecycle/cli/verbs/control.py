@@ -214,15 +214,15 @@ def status_command(
 
 
 def _watch(path: Path, format_: str) -> int:
-    from lifecycle.cli.standard_streams import Watched
+    from lifecycle.cli.standard_streams import watched
     from lifecycle.supervisor.control.server import follow
     from lifecycle.verify.outcome import Outcome
 
     verdict, is_json = None, format_ == "json"
-    with Watched(whole=not is_json) as shown, asking(path):
+    with watched(whole=not is_json) as show, asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            shown.show(json_of(status) if is_json else _on_screen(status))
+            show(json_of(status) if is_json else _on_screen(status))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 

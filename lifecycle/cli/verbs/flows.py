@@ -17,7 +17,6 @@ import click
 from lifecycle.cli.common import (
     asking,
     assignments_argument,
-    export_option,
     format_option,
     is_manifest,
     load_plan,
@@ -30,7 +29,7 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.flow_tables import Record, render_flows, watched_flows
 from lifecycle.cli.report import exit_code
-from lifecycle.cli.standard_streams import Watched
+from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
@@ -121,7 +120,12 @@ def command() -> None:
 )
 @click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
-@export_option
+@network_options(
+    "--export",
+    "export_",
+    help_="Print the verified flows as rules, settings or request bodies of another system "
+    "instead.",
+)
 def _show(
     *,
     target: str,
@@ -190,16 +194,16 @@ def _watch(plan: Plan, format_: str) -> int:
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
-    with Watched(whole=format_ == "text") as shown:
+    with watched(whole=format_ == "text") as show:
         if path is None:
             follow_running(
-                plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
+                plan, lambda seen: show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
             )
             return ExitCode.OK
         with asking(path):
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
-                    shown.show(watched_flows(seen.verdict, format_))
+                    show(watched_flows(seen.verdict, format_))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
 
@@ -302,7 +306,12 @@ def remove(plan: Plan) -> int:
 
 @command.command("apply")
 @manifest_arguments
-@network_options("--target", "Network to program; may be given several times.")
+@network_options(
+    "--target",
+    "targets",
+    help_="Network to program; may be given several times.",
+    multiple=True,
+)
 @click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
 @_timeout
 def _apply(

@@ -20,7 +20,7 @@ from lifecycle.cli.common import (
     timeout_option,
     write_text,
 )
-from lifecycle.cli.standard_streams import Watched
+from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -63,14 +63,14 @@ def command(
     from lifecycle.supervisor.control.protocol import look
     from lifecycle.supervisor.run import looking
 
-    with Watched(whole=watch and output is None and format_ == "text") as shown:
+    with watched(whole=watch and output is None and format_ == "text") as show:
 
         def draw(picture: Picture) -> None:
             text = render(picture, format_)
             if output is not None:
                 write_text(output, text.rstrip("\n") + "\n")
             else:
-                shown.show(text)
+                show(text)
 
         if path is not None:
             with asking(path):

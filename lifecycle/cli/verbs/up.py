@@ -80,7 +80,9 @@ if TYPE_CHECKING:
 )
 @network_options(
     "--program",
-    "Program this network with the verified flows while active; may be given several times.",
+    "targets",
+    help_="Program this network with the verified flows while active; may be given several times.",
+    multiple=True,
 )
 def command(
     *,
