@@ -368,18 +368,22 @@ def read_record(path: Path) -> RunRecord | None:
     # It may just take the place of the one before it.
     for name in (_RECORD_NAME, _PART_NAME, _RECORD_NAME):
         with contextlib.suppress(OSError, ValueError):
-            return codec.from_json(_regular(path / name), RunRecord, longest=_LONGEST_RECORD)
+            data = read_regular(path / name, _LONGEST_RECORD + 1, os.O_NOFOLLOW)
+            return codec.from_json(data, RunRecord, longest=_LONGEST_RECORD)
     return None
 
 
-def _regular(path: Path) -> bytes:
-    """Read a file, and no more than a record holds."""
-    # Not blocking: a pipe in its place might have no writer.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OURS)
+def read_regular(path: str | Path, most: int, flags: int = 0) -> bytes:
+    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
     with os.fdopen(descriptor, "rb") as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), str(path))
-        return file.read(_LONGEST_RECORD + 1)
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return file.read(most)
 
 
 def is_held(path: Path) -> bool:
