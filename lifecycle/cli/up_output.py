@@ -53,24 +53,6 @@ from lifecycle.verify.verdict import Stage, Verdict
 _AGAIN_S = 1.0
 
 
-class RunOutput:
-    """A listener that also shows how the run ended."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-
-    def __call__(self, event: Event) -> None:
-        """Show one event."""
-        raise NotImplementedError
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Take the way to ask for the status, once there is something to show; lines need none."""
-
-    def finish(self, result: UpResult) -> None:
-        """Show the result, and return once that is written or not taken."""
-        raise NotImplementedError
-
-
 @contextlib.contextmanager
 def output(format_: str) -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
@@ -78,22 +60,21 @@ def output(format_: str) -> Iterator[RunOutput]:
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
-    marker = _json_notice if format_ == "json" else "{}\n".format
-    is_terminal = format_ != "json" and sys.stdout.isatty()
+    marker: Callable[[str], str] = "{}\n".format
+    kind: type[RunOutput] = PlainLines
+    if format_ == "json":
+        marker, kind = (lambda text: _json_line(Notice(message=text))), JsonLines
+    elif sys.stdout.isatty():
+        marker, kind = "\r\x1b[K{}\n".format, TerminalLines
     writer = Writer(
         sys.stdout.fileno(),
         "standard output",
-        marker="\r\x1b[K{}\n".format if is_terminal else marker,
+        marker=marker,
         say=functools.partial(click.echo, err=True),
         encoding=sys.stdout.encoding,
     )
     with contextlib.closing(writer):
-        if format_ == "json":
-            yield JsonLines(writer)
-        elif is_terminal:
-            yield TerminalLines(writer)
-        else:
-            yield PlainLines(writer)
+        yield kind(writer)
 
 
 def _json_line(event: Event) -> str:
@@ -101,12 +82,14 @@ def _json_line(event: Event) -> str:
     return json_text(record) + "\n"
 
 
-def _json_notice(text: str) -> str:
-    return _json_line(Notice(message=text))
-
-
-class JsonLines(RunOutput):
+class JsonLines:
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+
+    def watch(self, _: Callable[[], SystemStatus]) -> None:
+        """Have the way to ask for the status; events say enough."""
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
@@ -157,16 +140,19 @@ _LOST = ("unconfigured", "inactive", "finalized", "errorprocessing")
 """States (lifecycle_msgs/State) to which somebody else has brought a node that is to be active."""
 
 
-class PlainLines(RunOutput):
+class PlainLines:
     """One line per event, for logs and pipes."""
 
     def __init__(self, writer: Writer, *, colour: bool = False, width: int = 100) -> None:
-        super().__init__(writer)
+        self._writer = writer
         self._colour = colour
         self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
+
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Take the way to ask for the status, once there is something to show; lines need none."""
 
     def __call__(self, event: Event) -> None:
         """Write one event, if it has a line for people."""
@@ -235,6 +221,10 @@ class TerminalLines(PlainLines):
     def _put(self, text: str, *, kept: bool = True) -> None:
         # The cursor stays in front of the line, for what others write.
         self._writer.put(f"\r\x1b[K{text}{self._below}\r", kept=kept)
+
+
+RunOutput = JsonLines | PlainLines
+"""What shows a run: a listener that also shows how it ended, by `finish`."""
 
 
 def describe(event: Event) -> str | None:

@@ -125,9 +125,12 @@ def _problem(found: Diagnostic, *, fails: bool = False) -> Problem:
 
 
 def _junit(report: CheckReport, *, strict: bool) -> str:
+    of_test: dict[str, list[Diagnostic]] = {name: [] for name in TESTS}
+    for each in report.diagnostics:
+        covers = (name for name, begin in TESTS.items() if each.rule.startswith(begin))
+        of_test[next(covers, "system")].append(each)
     cases = []
-    for name in TESTS:
-        found = [each for each in report.diagnostics if _test(each.rule) == name]
+    for name, found in of_test.items():
         bad = [
             str(each)
             for each in found
@@ -145,10 +148,6 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
             )
         )
     return junit([Suite(name=f"lifecycle check {report.manifest}", cases=cases)])
-
-
-def _test(rule: str) -> str:
-    return next((name for name, begin in TESTS.items() if rule.startswith(begin)), "system")
 
 
 def _sarif(report: CheckReport) -> str:

@@ -57,10 +57,11 @@ def status_text(
     above = [status_head(status), *([measured] if measured else [])]
     longest = max(_LEAST, width - _BESIDE) if height else 0
     heads, *rows = columns([_HEADS, *(_row(each, longest) for each in status.nodes)])
-    shown = [
-        [_coloured(line, node) if colour else line, *map(_connection, node.connections)]
-        for line, node in zip(rows, status.nodes, strict=True)
-    ]
+    shown = []
+    for line, node in zip(rows, status.nodes, strict=True):
+        style = _style(node) if colour else ""
+        coloured = f"{style}{line}{_PLAIN}" if style else line
+        shown.append([coloured, *map(_connection, node.connections)])
     if not height:
         return wrapped([*above, heads, *(line for each in shown for line in each)], width)
     above = [*wrapped(above, width).splitlines(), heads]
@@ -105,11 +106,6 @@ def _style(node: NodeStatus) -> str:
     return _YELLOW if node.managed and node.state != "active" else ""
 
 
-def _coloured(line: str, node: NodeStatus) -> str:
-    style = _style(node)
-    return f"{style}{line}{_PLAIN}" if style else line
-
-
 def _connection(connection: ConnectionReport) -> str:
     """Return one connection in one line: what it is, what it is to and what it carries."""
     made = "established" if connection.established else "waits for peers"
@@ -124,21 +120,17 @@ def _row(node: NodeStatus, longest: int) -> tuple[str, ...]:
     if longest and len(name) > longest:
         name = f"…{name[1 - longest :]}"
     process = "not ours" if node.process_state is None else node.process_state.value
+    known = node.matched or node.unreported < node.endpoints or not node.endpoints
     cells = (
         name,
         process,
         str(node.pid or "–"),
         "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
-        _matched(node),
+        f"{node.matched if known else '–'}/{node.endpoints}",
         f"{node.unique_flows}/{node.flows}",
         node.died or (f"silent: {node.silent}" if node.silent else node.doing) or _history(node),
     )
     return tuple(map(one_line, cells))
-
-
-def _matched(node: NodeStatus) -> str:
-    known = node.matched or node.unreported < node.endpoints or not node.endpoints
-    return f"{node.matched if known else '–'}/{node.endpoints}"
 
 
 def _history(node: NodeStatus) -> str:
@@ -222,16 +214,15 @@ def _watch(path: Path, format_: str) -> int:
     with watched(whole=not is_json) as show, asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            show(json_of(status) if is_json else _on_screen(status))
+            if is_json:
+                show(json_of(status))
+            elif sys.stdout.isatty():
+                width, height = shutil.get_terminal_size()
+                show(status_text(status, width=width, height=height, colour=True))
+            else:
+                show(status_text(status))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
-
-
-def _on_screen(status: SystemStatus) -> str:
-    if not sys.stdout.isatty():
-        return status_text(status)
-    width, height = shutil.get_terminal_size()
-    return status_text(status, width=width, height=height, colour=True)
 
 
 def _list_running(format_: str) -> int:

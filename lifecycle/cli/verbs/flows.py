@@ -37,11 +37,10 @@ from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
-    from lifecycle.measure.flows import FlowMeasurement
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
     from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen, TargetChanges
+    from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.run.looking import JudgedSystem
 
 
@@ -145,13 +144,11 @@ def _show(
         raise UsageError("cannot use --for or --force without --record FILE")
     if record is not None and (watch or export_ is not None):
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
-    exported = None
+    if watch and export_ is not None:
+        raise UsageError("cannot use --export with --watch; export once")
     if export_ is not None:
-        if watch:
-            raise UsageError("cannot use --export with --watch; export once")
         # What is exported for a network takes what programming it takes.
         (network,), treatment = read_networks((export_,), rest, option="--export")
-        exported = (network, treatment)
     elif any(rest.values()):
         raise UsageError(
             "cannot say how to treat flows that are only shown",
@@ -171,8 +168,8 @@ def _show(
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         click.echo(lines(each), err=True)
-    if exported is not None:
-        export(seen.plan, seen.verdict.flows, *exported)
+    if export_ is not None:
+        export(seen.plan, seen.verdict.flows, network, treatment)
     else:
         flows, measured = seen.verdict.flows, seen.verdict.measured
         click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
@@ -289,7 +286,8 @@ def apply(
             path = shlex.quote(plan.manifest_path)
             error.hint = f"take back what was done: lifecycle flows remove {path}"
         raise
-    _show_changes(changes, done=not dry_run)
+    for each in changes:
+        click.echo(each.render(done=not dry_run))
     _show_left_out(programmer.left_out)
     return any(each.pending for each in changes)
 
@@ -297,9 +295,9 @@ def apply(
 def remove(plan: Plan) -> int:
     """Remove everything of the system from every network that it was applied to."""
     changes = _open(plan, ()).close()
-    if changes:
-        _show_changes(changes, done=True)
-    else:
+    for each in changes:
+        click.echo(each.render(done=True))
+    if not changes:
         click.echo(f"nothing of system {plan.system} is in any network")
     return ExitCode.OK
 
@@ -371,7 +369,10 @@ def _measured_again(seen: JudgedSystem) -> JudgedSystem:
         if not any(each.violated for each in seen.verdict.measured):
             break
         time.sleep(1.0)
-    click.echo(before_and_after(before, seen.verdict.measured))
+    now = {each.pair: each.describe() for each in seen.verdict.measured}
+    for each in before:
+        click.echo(lines(f"before: {each.describe()}"))
+        click.echo(lines(f"after:  {now.get(each.pair, f'{each.name}: not measured')}"))
     return seen
 
 
@@ -380,17 +381,6 @@ _FRESH_S = 6.0
 
 _SETTLED_S = 4
 """Seconds more for numbers that are not kept: they may be of a queue that was full before."""
-
-
-def before_and_after(before: Iterable[FlowMeasurement], after: Iterable[FlowMeasurement]) -> str:
-    """Return what was measured of each flow before and after, a line for each."""
-    now = {each.pair: each for each in after}
-    said = []
-    for each in before:
-        then = now.get(each.pair)
-        said.append(f"before: {each.describe()}")
-        said.append(f"after:  {f'{each.name}: not measured' if then is None else then.describe()}")
-    return lines("\n".join(said))
 
 
 @command.command("remove")
@@ -404,11 +394,6 @@ def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = N
     from lifecycle.programming.programmer import open_programmer
 
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
-
-
-def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
-    for each in changes:
-        click.echo(each.render(done=done))
 
 
 def _show_left_out(flows: Iterable[str]) -> None:
