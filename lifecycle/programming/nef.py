@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import re
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -182,17 +181,14 @@ def _refused(subscription: _Subscription) -> str:
 
 
 def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
-    wanted, shown = (
-        each
-        if each.flow_info is None
-        else replace(each, flow_info=_in_one_spelling(each.flow_info))
-        for each in (msgspec.convert(asked, _Subscription), seen)
-    )
-    return differs(to_builtins(wanted), shown, _COMPARED, missing=missing)
+    def in_one_spelling(each: _Subscription) -> _Subscription:
+        if each.flow_info is None:
+            return each
+        flows = (sorted(map(_spelled, flow.flow_descriptions)) for flow in each.flow_info)
+        return replace(each, flow_info=tuple(_Flow(tuple(filters)) for filters in flows))
 
-
-def _in_one_spelling(flows: Iterable[_Flow]) -> tuple[_Flow, ...]:
-    return tuple(_Flow(tuple(sorted(map(_spelled, each.flow_descriptions)))) for each in flows)
+    wanted = to_builtins(in_one_spelling(msgspec.convert(asked, _Subscription)))
+    return differs(wanted, in_one_spelling(seen), _COMPARED, missing=missing)
 
 
 TARGET = NefTarget

@@ -257,11 +257,6 @@ def divide(
     return found
 
 
-def _table_name(system: str, device: str) -> str:
-    """The name of a device's table, `flowtc_eth0_teleop`."""
-    return table_name(system, f"flowtc_{re.sub(r'[^A-Za-z0-9_.-]', '_', device)}")
-
-
 def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]:
     device, link_kbit, major = settings.device, settings.link_kbit, OWNED_HANDLE
     rates = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
@@ -292,7 +287,8 @@ class TcTarget(TableTarget):
 
     def __init__(self, settings: TcSettings, means: Means, tool: HostTool | None = None) -> None:
         self._device = settings.device
-        table = _table_name(means.ledger.system, self._device)
+        device = re.sub(r"[^A-Za-z0-9_.-]", "_", self._device)
+        table = table_name(means.ledger.system, f"flowtc_{device}")
         super().__init__(settings, means, tool, table=table, scope=self._device)
         self.name = f"tc on {self._device}"
 
