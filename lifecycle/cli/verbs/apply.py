@@ -97,7 +97,15 @@ def command(
         outcome = "unchanged"
     else:
         if as_text:
-            click.echo(lines("\n".join(_changed(change))))
+            what = {
+                "added": change.added,
+                "removed": change.removed,
+                "restarted": change.restarted,
+                "given parameters": change.parameters,
+            }
+            done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
+            done = done or ["no node is touched: what runs is judged by the new rules"]
+            click.echo(lines("\n".join((*change.differences, *done))))
         outcome = "would_apply"
     if outcome == "would_apply" and not dry_run:
         wait_s = 2 * timeout + _SPARE_S
@@ -114,10 +122,16 @@ def command(
         error=answer.error,
         **asdict(change or ChangedNodes(revision=0)),
     )
-    if as_text:
-        _say(report)
-    else:
+    if not as_text:
         click.echo(json_of(report))
+    elif report.error:
+        click.echo(lines(report.error), err=True)
+    elif outcome == "unchanged":
+        click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
+    elif outcome == "applied":
+        click.echo(
+            f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
+        )
     return report.exit_code
 
 
@@ -169,29 +183,3 @@ def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: f
             "at it",
             hint=f"see what it does: lifecycle status {path.name}",
         ) from error
-
-
-def _say(report: ApplyReport) -> None:
-    if report.error:
-        click.echo(lines(report.error), err=True)
-    elif report.outcome == "unchanged":
-        click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
-    elif report.outcome == "applied":
-        click.echo(
-            f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
-        )
-
-
-def _changed(change: ChangedNodes) -> list[str]:
-    """Return how the manifests differ, and what becomes of which node."""
-    what = {
-        "added": change.added,
-        "removed": change.removed,
-        "restarted": change.restarted,
-        "given parameters": change.parameters,
-    }
-    done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
-    return [
-        *change.differences,
-        *(done or ["no node is touched: what runs is judged by the new rules"]),
-    ]
