@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import click
 from msgspec.structs import asdict
 
-from lifecycle.cli.common import (
-    assignments_argument,
-    completing,
-    format_option,
-    json_of,
-    load_plan,
-    machine_option,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.codec import Count, says
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import lines
@@ -60,14 +52,14 @@ class ApplyReport(ChangedNodes, frozen=True, kw_only=True):
 
 
 @click.command("apply")
-@click.argument("manifest", metavar="MANIFEST", shell_complete=completing("manifests"))
-@assignments_argument
-@machine_option("As it was given to `lifecycle up`.")
+@click.argument("manifest", metavar="MANIFEST", shell_complete=common.completing("manifests"))
+@common.assignments_argument
+@common.machine_option("As it was given to `lifecycle up`.")
 @click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
-@timeout_option(
+@common.timeout_option(
     60.0, "Until the system must be active by it; else it goes back to the manifest before."
 )
-@format_option("text", "json")
+@common.format_option("text", "json")
 def command(
     *,
     manifest: str,
@@ -86,7 +78,7 @@ def command(
     4 or 5 for a verdict, with 6 for a step. Exits with 2 where a running supervisor cannot take
     it, and with 0 once the system is active and verified by it.
     """
-    plan = load_plan(manifest, assignments, machine=machine)
+    plan = common.load_plan(manifest, assignments, machine=machine)
     path = _run_of(plan, machine)
     as_text = format_ == "text"
     answer = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
@@ -123,7 +115,7 @@ def command(
         **asdict(change or ChangedNodes(revision=0)),
     )
     if not as_text:
-        click.echo(json_of(report))
+        click.echo(common.json_of(report))
     elif report.error:
         click.echo(lines(report.error), err=True)
     elif outcome == "unchanged":

@@ -14,15 +14,7 @@ import click
 import msgspec
 
 from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
-from lifecycle.cli.common import (
-    format_option,
-    json_of,
-    machine_option,
-    manifest_arguments,
-    parse_assignments,
-    resolve,
-    run_commands_option,
-)
+from lifecycle.cli import common
 from lifecycle.cli.report import (
     report_format,
     report_option,
@@ -81,7 +73,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     What is unproven or could not be resolved is a failure if it is `strict`.
     """
     if format_ == "json":
-        return json_of(report)
+        return common.json_of(report)
     if format_ == "sarif":
         return _sarif(report).rstrip("\n")
     if format_ == "junit":
@@ -174,18 +166,18 @@ _UNRESOLVED = "program.unresolved"
 
 
 @click.command()
-@manifest_arguments
-@format_option("text", "json", "sarif", "junit", "github")
+@common.manifest_arguments
+@common.format_option("text", "json", "sarif", "junit", "github")
 @click.option(
     "--strict",
     is_flag=True,
     help="Let what is not proven (warnings, what could not be resolved) fail it, too.",
 )
-@machine_option("The machine that this host is; default: all whose address is this host's.")
+@common.machine_option("The machine that this host is; default: all whose address is this host's.")
 @click.option(
     "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
 )
-@run_commands_option
+@common.run_commands_option
 @report_option
 def command(
     *,
@@ -231,7 +223,7 @@ def _list(path: str, format_: str, *, others: bool) -> int:
         )
     found = declared_arguments(path)
     if format_ == "json":
-        click.echo(json_of(found))
+        click.echo(common.json_of(found))
     else:
         text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
         click.echo(lines(text))
@@ -277,9 +269,9 @@ def check(
     loaded: Manifest | None = None
     resolution = Resolution()
     try:
-        result = load(path, parse_assignments(assignments), run_commands=run_commands)
+        result = load(path, common.parse_assignments(assignments), run_commands=run_commands)
         effective_domain(result.manifest.discovery, os.environ)
-        resolution = resolve(result.manifest, machine)
+        resolution = common.resolve(result.manifest, machine)
         diagnostics = (
             *result.warnings,
             *check_plan(result.manifest, files=result.files),

@@ -14,19 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import (
-    asking,
-    assignments_argument,
-    format_option,
-    is_manifest,
-    load_plan,
-    manifest_arguments,
-    network_options,
-    read_networks,
-    target_argument,
-    target_plan,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.cli.flow_tables import Record, render_flows, watched_flows
 from lifecycle.cli.report import exit_code
 from lifecycle.cli.standard_streams import watched
@@ -65,7 +53,7 @@ _EMPTY_GRAPH_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
-_timeout = timeout_option(5.0, "How long flows that are not complete may still become so.")
+_timeout = common.timeout_option(5.0, "How long flows that are not complete may still become so.")
 
 
 class _ShowsByDefault(click.Group):
@@ -100,9 +88,9 @@ def command() -> None:
 
 
 @command.command("show", hidden=True)
-@target_argument
-@assignments_argument
-@format_option("text", "json", "csv")
+@common.target_argument
+@common.assignments_argument
+@common.format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @click.option(
     "--record",
@@ -119,7 +107,7 @@ def command() -> None:
 )
 @click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
-@network_options(
+@common.network_options(
     "--export",
     "export_",
     help_="Print the verified flows as rules, settings or request bodies of another system "
@@ -148,7 +136,7 @@ def _show(
         raise UsageError("cannot use --export with --watch; export once")
     if export_ is not None:
         # What is exported for a network takes what programming it takes.
-        (network,), treatment = read_networks((export_,), rest, option="--export")
+        (network,), treatment = common.read_networks((export_,), rest, option="--export")
     elif any(rest.values()):
         raise UsageError(
             "cannot say how to treat flows that are only shown",
@@ -197,7 +185,7 @@ def _watch(plan: Plan, format_: str) -> int:
                 plan, lambda seen: show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
             )
             return ExitCode.OK
-        with asking(path):
+        with common.asking(path):
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
                     show(watched_flows(seen.verdict, format_))
@@ -252,12 +240,12 @@ def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
-    if is_manifest(target) or target.endswith((".yaml", ".yml")):
-        return load_plan(target, assignments)
+    if common.is_manifest(target) or target.endswith((".yaml", ".yml")):
+        return common.load_plan(target, assignments)
     from lifecycle.supervisor.control.protocol import look
 
-    path, _ = target_plan(os.environ, target, assignments, "")
-    with asking(path):
+    path, _ = common.target_plan(os.environ, target, assignments, "")
+    with common.asking(path):
         return look(path).plan
 
 
@@ -303,8 +291,8 @@ def remove(plan: Plan) -> int:
 
 
 @command.command("apply")
-@manifest_arguments
-@network_options(
+@common.manifest_arguments
+@common.network_options(
     "--target",
     "targets",
     help_="Network to program; may be given several times.",
@@ -326,12 +314,12 @@ def _apply(
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    options, treatment = read_networks(targets, rest, option="--target")
+    options, treatment = common.read_networks(targets, rest, option="--target")
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
-    plan = load_plan(manifest, assignments)
+    plan = common.load_plan(manifest, assignments)
     seen = judge_running(plan, timeout_s=timeout, strict=False)
     seen = with_supervisors_numbers(seen)
     for each in seen.notices:
@@ -384,10 +372,10 @@ _SETTLED_S = 4
 
 
 @command.command("remove")
-@manifest_arguments
+@common.manifest_arguments
 def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
-    return remove(load_plan(manifest, assignments))
+    return remove(common.load_plan(manifest, assignments))
 
 
 def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:

@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import (
-    asking,
-    format_option,
-    is_manifest,
-    json_of,
-    load_plan,
-    output_option,
-    target_arguments,
-    target_run,
-    timeout_option,
-    write_text,
-)
+from lifecycle.cli import common
 from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 
@@ -29,11 +18,11 @@ if TYPE_CHECKING:
 
 
 @click.command("graph")
-@target_arguments
-@format_option("text", "mermaid", "svg", "html", "json")
-@output_option("picture")
+@common.target_arguments
+@common.format_option("text", "mermaid", "svg", "html", "json")
+@common.output_option("picture")
 @click.option("--watch", is_flag=True, help="Draw it again at every change; Ctrl-C ends.")
-@timeout_option(
+@common.timeout_option(
     2.0,
     "How long what is not as declared may still become so, where no supervisor is asked.",
     or_0=True,
@@ -68,12 +57,12 @@ def command(
         def draw(picture: Picture) -> None:
             text = render(picture, format_)
             if output is not None:
-                write_text(output, text.rstrip("\n") + "\n")
+                common.write_text(output, text.rstrip("\n") + "\n")
             else:
                 show(text)
 
         if path is not None:
-            with asking(path):
+            with common.asking(path):
                 if not watch:
                     draw(looking.picture_of(look(path)))
                 else:
@@ -95,18 +84,18 @@ def _found(
     target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path | None, Plan | None]:
     """Return the run of a supervisor, or the plan to look for without one."""
-    if not is_manifest(target):
-        return target_run(os.environ, target, assignments, machine), None
+    if not common.is_manifest(target):
+        return common.target_run(os.environ, target, assignments, machine), None
     from lifecycle.supervisor.run.looking import supervisor_of
 
-    plan = load_plan(target, assignments, quiet=True)
+    plan = common.load_plan(target, assignments, quiet=True)
     return supervisor_of(os.environ, plan, machine), plan
 
 
 def render(picture: Picture, format_: str) -> str:
     """Return a picture in one of the formats of `--format`."""
     if format_ == "json":
-        return json_of(picture)
+        return common.json_of(picture)
     from lifecycle.export.picture_writers import WRITERS
 
     return WRITERS[format_](picture)

@@ -7,12 +7,7 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import (
-    format_option,
-    load_plan,
-    manifest_arguments,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.cli.report import (
     ReportFile,
     exit_code,
@@ -23,9 +18,9 @@ from lifecycle.printable import lines
 
 
 @click.command("verify")
-@manifest_arguments
-@format_option("text", "json", "junit", "sarif", "github")
-@timeout_option(5.0, "How long a graph that is not ok may still become so.")
+@common.manifest_arguments
+@common.format_option("text", "json", "junit", "sarif", "github")
+@common.timeout_option(5.0, "How long a graph that is not ok may still become so.")
 @click.option("--strict", is_flag=True, help="Exit 5 if anything could not be verified.")
 @report_option
 def command(  # noqa: PLR0917 - click passes options by name
@@ -51,7 +46,7 @@ def command(  # noqa: PLR0917 - click passes options by name
         ):
             from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
-            plan = load_plan(manifest, assignments)
+            plan = common.load_plan(manifest, assignments)
             written.begin(plan)
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             seen = with_supervisors_numbers(seen)
