@@ -15,11 +15,7 @@ import msgspec
 
 from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
 from lifecycle.cli import common
-from lifecycle.cli.report import (
-    report_format,
-    report_option,
-    write_report,
-)
+from lifecycle.cli.report import report_format, report_option, write_report
 from lifecycle.codec import Count
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity

@@ -8,12 +8,7 @@ from pathlib import Path
 import click
 
 from lifecycle.cli import common
-from lifecycle.cli.report import (
-    ReportFile,
-    exit_code,
-    format_verdict,
-    report_option,
-)
+from lifecycle.cli.report import ReportFile, exit_code, format_verdict, report_option
 from lifecycle.printable import lines
 
 
