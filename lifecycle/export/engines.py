@@ -353,12 +353,13 @@ def _dns_label(text: str) -> str:
 
 def _command(words: tuple[str, ...]) -> str:
     """Return a command line as systemd.service(5) reads it; `%` and `$` stand for themselves."""
-    return " ".join(map(_word, words))
-
-
-def _word(word: str) -> str:
-    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
-    # A line break would end the command, and begin a setting of its own.
-    escaped = re.sub(r"[\x01-\x1f\x7f]", lambda sign: f"\\x{ord(sign[0]):02x}", escaped)
-    plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
-    return escaped if plain else f'"{escaped}"'
+    said = []
+    for word in words:
+        escaped = (
+            word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+        )
+        # A line break would end the command, and begin a setting of its own.
+        escaped = re.sub(r"[\x01-\x1f\x7f]", lambda sign: f"\\x{ord(sign[0]):02x}", escaped)
+        plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
+        said.append(escaped if plain else f'"{escaped}"')
+    return " ".join(said)
