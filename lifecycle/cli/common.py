@@ -276,9 +276,7 @@ def machine_option(help_: str) -> Callable[[F], F]:
     )
 
 
-def target_run(
-    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
-) -> Path:
+def target_run(target: str, assignments: tuple[str, ...], machine: str) -> Path:
     """Return the run directory that a target names: a manifest's, or a system's by name.
 
     A manifest that is no longer the one that runs is reported on stderr, and makes no difference.
@@ -287,7 +285,7 @@ def target_run(
         UsageError: no such run.
         ManifestError: the manifest cannot be loaded, so that its domain is not known.
     """
-    path, plan = target_plan(environment, target, assignments, machine)
+    path, plan = target_plan(target, assignments, machine)
     if plan is not None:
         from lifecycle.supervisor.control.protocol import differences
 
@@ -319,7 +317,7 @@ def is_manifest(target: str) -> bool:
 
 
 def target_plan(
-    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
+    target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path, Plan | None]:
     """Return the run directory that a target names, and the plan if it is a manifest.
 
@@ -329,7 +327,7 @@ def target_plan(
     """
     from lifecycle.run_directory import find_run, run_name, run_roots
 
-    roots = run_roots(environment)
+    roots = run_roots(os.environ)
     if not is_manifest(target):
         if assignments:
             raise UsageError(

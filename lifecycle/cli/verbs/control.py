@@ -171,7 +171,7 @@ def status_command(
         if watch:
             raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
         return _list_running(format_)
-    path = common.target_run(os.environ, target, assignments, machine)
+    path = common.target_run(target, assignments, machine)
     if watch:
         return _watch(path, format_)
 
@@ -247,9 +247,9 @@ def _give_order(
     """
     plan = None
     if verb == "pause":  # which may be of a manifest that has changed
-        path = common.target_run(os.environ, target, assignments, machine)
+        path = common.target_run(target, assignments, machine)
     else:
-        path, plan = common.target_plan(os.environ, target, assignments, machine)
+        path, plan = common.target_plan(target, assignments, machine)
     from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
@@ -282,7 +282,7 @@ def down_command(
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
     supervisor itself was killed, what it left behind is ended too.
     """
-    path = common.target_run(os.environ, target, assignments, machine)
+    path = common.target_run(target, assignments, machine)
     from lifecycle.supervisor.control.protocol import down
 
     try:

@@ -244,7 +244,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
         return common.load_plan(target, assignments)
     from lifecycle.supervisor.control.protocol import look
 
-    path, _ = common.target_plan(os.environ, target, assignments, "")
+    path, _ = common.target_plan(target, assignments, "")
     with common.asking(path):
         return look(path).plan
 

@@ -48,14 +48,21 @@ def command(
         raise UsageError(
             f"cannot print one {format_} picture after another", hint="give --output FILE"
         )
-    path, plan = _found(target, assignments, machine)
+    from lifecycle.export.picture_writers import WRITERS
     from lifecycle.supervisor.control.protocol import look
     from lifecycle.supervisor.run import looking
+
+    plan: Plan | None = None
+    if not common.is_manifest(target):
+        path: Path | None = common.target_run(target, assignments, machine)
+    else:
+        plan = common.load_plan(target, assignments, quiet=True)
+        path = looking.supervisor_of(os.environ, plan, machine)
 
     with watched(whole=watch and output is None and format_ == "text") as show:
 
         def draw(picture: Picture) -> None:
-            text = render(picture, format_)
+            text = common.json_of(picture) if format_ == "json" else WRITERS[format_](picture)
             if output is not None:
                 common.write_text(output, text.rstrip("\n") + "\n")
             else:
@@ -78,24 +85,3 @@ def command(
     if path is not None and watch:
         click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
-
-
-def _found(
-    target: str, assignments: tuple[str, ...], machine: str
-) -> tuple[Path | None, Plan | None]:
-    """Return the run of a supervisor, or the plan to look for without one."""
-    if not common.is_manifest(target):
-        return common.target_run(os.environ, target, assignments, machine), None
-    from lifecycle.supervisor.run.looking import supervisor_of
-
-    plan = common.load_plan(target, assignments, quiet=True)
-    return supervisor_of(os.environ, plan, machine), plan
-
-
-def render(picture: Picture, format_: str) -> str:
-    """Return a picture in one of the formats of `--format`."""
-    if format_ == "json":
-        return common.json_of(picture)
-    from lifecycle.export.picture_writers import WRITERS
-
-    return WRITERS[format_](picture)
