@@ -167,7 +167,7 @@ def load_plan(
         warnings = (*warnings, *found)
     if not quiet:
         for warning in warnings:
-            click.echo(lines(str(warning)), err=True)
+            say(str(warning))
     return build_plan(loaded.manifest, domain_id=domain_id)
 
 
@@ -240,6 +240,11 @@ def replace_text(path: Path, text: str) -> None:
         raise
 
 
+def say(text: str) -> None:
+    """Say something on standard error, printable: parts of it are what others have chosen."""
+    click.echo(lines(text), err=True)
+
+
 def terminal_width() -> int:
     """Return how many columns standard output has; 0 where it is no terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
@@ -291,10 +296,7 @@ def target_run(target: str, assignments: tuple[str, ...], machine: str) -> Path:
 
         if found := differences(path, plan):
             listed = "\n".join(found)
-            click.echo(
-                f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}",
-                err=True,
-            )
+            say(f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}")
     return path
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 
-import click
-
+from lifecycle.cli.common import say
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.verbs.control import status_head
 from lifecycle.node.host.control import Operation
@@ -44,7 +42,7 @@ def output(format_: str) -> Iterator[RunOutput]:
         sys.stdout.fileno(),
         "standard output",
         marker=marker,
-        say=functools.partial(click.echo, err=True),
+        say=say,
         encoding=sys.stdout.encoding,
     )
     with contextlib.closing(writer):

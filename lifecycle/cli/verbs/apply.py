@@ -117,7 +117,7 @@ def command(
     if not as_text:
         click.echo(common.json_of(report))
     elif report.error:
-        click.echo(lines(report.error), err=True)
+        common.say(report.error)
     elif outcome == "unchanged":
         click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
     elif outcome == "applied":

@@ -12,7 +12,7 @@ import click
 from lifecycle.cli import common
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.measure.flows import measured_summary
-from lifecycle.printable import columns, count, lines, one_line
+from lifecycle.printable import columns, count, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -207,7 +207,7 @@ def _watch(path: Path, format_: str) -> int:
                 show(status_text(status, width=width, height=height, colour=True))
             else:
                 show(status_text(status))
-    click.echo(f"{path.name}: its supervisor has ended", err=True)
+    common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 
 
@@ -221,7 +221,7 @@ def _list_running(format_: str) -> int:
     else:
         click.echo("\n".join(names) or "no system runs")
         for each in left_behind(*roots):
-            click.echo(lines(str(lost(each))), err=True)
+            common.say(str(lost(each)))
     return ExitCode.OK
 
 
@@ -256,10 +256,10 @@ def _give_order(
     try:
         answer = order(path, question, timeout)
     except TimeoutError:
-        click.echo(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it", err=True)
+        common.say(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it")
         return ExitCode.BRING_UP_FAILED
     if answer.error:
-        click.echo(lines(answer.error), err=True)
+        common.say(answer.error)
     assert answer.exit_code is not None
     return answer.exit_code
 
@@ -288,7 +288,7 @@ def down_command(
     try:
         return down(path, timeout)
     except TimeoutError:
-        click.echo(f"cannot end {path.name!r} within {timeout:g} s; it still runs", err=True)
+        common.say(f"cannot end {path.name!r} within {timeout:g} s; it still runs")
         return ExitCode.BRING_UP_FAILED
 
 

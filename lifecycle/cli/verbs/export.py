@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import F, load_plan, manifest_arguments, write_text
+from lifecycle.cli.common import F, load_plan, manifest_arguments, say, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.printable import lines
@@ -55,10 +55,9 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     write_text(output / "policy.xml", render_policy(enclaves))
     for node in plan.nodes:
         if node.endpoint_policy is EndpointPolicy.OPEN:
-            click.echo(
+            say(
                 f"{node.full_name} may make endpoints that are not declared (endpoints: open): "
-                "these are denied; declare those that it needs",
-                err=True,
+                "these are denied; declare those that it needs"
             )
     click.echo(lines(_next_commands(enclaves, output, plan.domain_id)))
     return ExitCode.OK
@@ -174,14 +173,11 @@ def _say_secret(word: str, engine: str) -> None:
     if not value or shown(name, value) == value:
         return
     variable = name.upper().replace("-", "_")
-    click.echo(
-        lines(
-            f"warning: the value of {name!r} is in what was written as it was given, and will be "
-            "in a command line, which every user of the machine can read; have the manifest take "
-            f"it from the environment, 'default: $(env {variable} \"\")', leave it out here, and "
-            f"give it by {_VARIABLES[engine]}"
-        ),
-        err=True,
+    say(
+        f"warning: the value of {name!r} is in what was written as it was given, and will be "
+        "in a command line, which every user of the machine can read; have the manifest take "
+        f"it from the environment, 'default: $(env {variable} \"\")', leave it out here, and "
+        f"give it by {_VARIABLES[engine]}"
     )
 
 

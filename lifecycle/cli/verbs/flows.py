@@ -155,7 +155,7 @@ def _show(
     seen = looking.judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
-        click.echo(lines(each), err=True)
+        common.say(each)
     if export_ is not None:
         export(seen.plan, seen.verdict.flows, network, treatment)
     else:
@@ -189,7 +189,7 @@ def _watch(plan: Plan, format_: str) -> int:
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
                     show(watched_flows(seen.verdict, format_))
-    click.echo(f"{path.name}: its supervisor has ended", err=True)
+    common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.OK
 
 
@@ -214,7 +214,7 @@ def _record(plan: Plan, record: Record, for_s: float | None) -> int:
                     for_s=for_s,
                 )
         finally:
-            click.echo(f"{count(record.rows, 'row')} in {str(record.path)!r}", err=True)
+            common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
     return ExitCode.OK
 
 
@@ -233,7 +233,7 @@ def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
         except UsageError:
             if number == 0:
                 raise
-            click.echo(f"{path.name}: its supervisor has ended", err=True)
+            common.say(f"{path.name}: its supervisor has ended")
             return
         record.add(measured)
 
@@ -323,7 +323,7 @@ def _apply(
     seen = judge_running(plan, timeout_s=timeout, strict=False)
     seen = with_supervisors_numbers(seen)
     for each in seen.notices:
-        click.echo(lines(each), err=True)
+        common.say(each)
     flows = seen.verdict.flows
     changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
     if changed and dry_run:
@@ -332,7 +332,7 @@ def _apply(
         seen = _measured_again(seen)
     if code := exit_code(seen.verdict, strict=False):
         found = f"{seen.verdict.verdict.value}; {not_ok(seen.verdict)}"
-        click.echo(lines(f"the system is {found}"), err=True)
+        common.say(f"the system is {found}")
     return code
 
 
@@ -343,12 +343,9 @@ def _measured_again(seen: JudgedSystem) -> JudgedSystem:
         machine = {each.full_name: each.machine for each in seen.plan.nodes}
         there = sorted({machine[each.subscription] for each in seen.verdict.flows} - {""})
         on = f" on {' and '.join(there)}" if there else ""
-        click.echo(
-            lines(f"what arrives is measured{on}: see `lifecycle status {seen.plan.system}` there"),
-            err=True,
-        )
+        common.say(f"what arrives is measured{on}: see `lifecycle status {seen.plan.system}` there")
         return seen
-    click.echo(f"measuring for {_FRESH_S:g} s what has changed", err=True)
+    common.say(f"measuring for {_FRESH_S:g} s what has changed")
     from lifecycle.supervisor.run.looking import with_supervisors_numbers
 
     time.sleep(_FRESH_S)
@@ -387,4 +384,4 @@ def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = N
 def _show_left_out(flows: Iterable[str]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in flows:
-        click.echo(lines(f"left out: {each}"), err=True)
+        common.say(f"left out: {each}")

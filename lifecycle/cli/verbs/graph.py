@@ -81,7 +81,7 @@ def command(
             judged = looking.judge_running(plan, timeout_s=timeout, strict=False)
             draw(judged.picture)
             if judged.where:
-                click.echo(judged.where, err=True)
+                common.say(judged.where)
     if path is not None and watch:
-        click.echo(f"{path.name}: its supervisor has ended", err=True)
+        common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.OK

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import completing, format_option
+from lifecycle.cli.common import completing, format_option, say
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import json_text, one_line
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.run.journal import RecordedRun
@@ -45,7 +45,7 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
             path = ros_log_root(os.environ) / run
     recorded = read_run(journal_files(path))
     for place, why in recorded.unreadable:
-        click.echo(lines(f"passed over {place}: {why}"), err=True)
+        say(f"passed over {place}: {why}")
     if recorded.run is None:
         raise UsageError(f"cannot read {str(path)!r} as a journal: no line says of which run")
     return recorded

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import completing, load_plan
+from lifecycle.cli.common import completing, load_plan, say
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.middleware.fastdds.discovery import peers_environment
@@ -60,10 +60,9 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     resources = planned.run.resources.properties() if planned.run.resources is not None else ()
     if resources:
         scope = "".join(f" -p {each}" for each in resources)
-        click.echo(
+        say(
             f"warning: the resources of {planned.full_name} are not limited here, as by lifecycle "
-            f"up: systemd-run --user --scope{scope} lifecycle run ...",
-            err=True,
+            f"up: systemd-run --user --scope{scope} lifecycle run ..."
         )
     if planned.run.limits:
         limit_resources(planned.run.limits.resources())

@@ -158,7 +158,7 @@ def command(
             finally:
                 process.close()
     except Ended as ended:
-        click.echo(f"ended before anything was started: {ended.reason}", err=True)
+        common.say(f"ended before anything was started: {ended.reason}")
         return ended.exit_code
 
 

@@ -9,7 +9,6 @@ import click
 
 from lifecycle.cli import common
 from lifecycle.cli.report import ReportFile, exit_code, format_verdict, report_option
-from lifecycle.printable import lines
 
 
 @click.command("verify")
@@ -48,11 +47,11 @@ def command(  # noqa: PLR0917 - click passes options by name
             with ending.noted():
                 unwritten = written.end(seen.verdict)
     except Ended as ended:
-        click.echo(f"ended before it was judged: {ended.reason}", err=True)
+        common.say(f"ended before it was judged: {ended.reason}")
         return ended.exit_code
     # From here on a signal ends what waits for a reader.
     for each in seen.notices:
-        click.echo(lines(each), err=True)
+        common.say(each)
     colour = format_ == "text" and sys.stdout.isatty()
     text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
     click.echo(text.rstrip("\n"))
