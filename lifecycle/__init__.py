@@ -14,13 +14,7 @@ if TYPE_CHECKING:
     from lifecycle.node.callbacks import GoalInterruptedError
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
-    from lifecycle.node.node import (
-        ERROR,
-        FAILURE,
-        SUCCESS,
-        LifecycleNode,
-        TransitionCallbackReturn,
-    )
+    from lifecycle.node.node import ERROR, FAILURE, SUCCESS, LifecycleNode, TransitionCallbackReturn
 
 __all__ = [
     "ERROR",

@@ -58,27 +58,25 @@ def junit(suites: Iterable[Suite], *, name: str = "") -> str:
     for suite in suites:
         element = ET.SubElement(root, "testsuite", name=lines(suite.name))
         for case in suite.cases:
-            _case(element, case)
+            one = ET.SubElement(
+                element, "testcase", classname=case.classname, name=lines(case.name)
+            )
+            if case.at:
+                file, line, _ = _place(case.at)
+                one.set("file", lines(file))
+                one.set("line", line)
+            if case.failure is not None:
+                message, text = map(lines, case.failure)
+                ET.SubElement(one, "failure", message=message).text = text
+            _note(one, case.note)
+            if case.skipped:
+                ET.SubElement(one, "skipped", message=case.skipped)
         _note(element, suite.note)
         _count(element, suite.cases)
         every += suite.cases
     _count(root, every)
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _case(suite: ET.Element, case: Case) -> None:
-    element = ET.SubElement(suite, "testcase", classname=case.classname, name=lines(case.name))
-    if case.at:
-        file, line, _ = _place(case.at)
-        element.set("file", lines(file))
-        element.set("line", line)
-    if case.failure is not None:
-        message, text = map(lines, case.failure)
-        ET.SubElement(element, "failure", message=message).text = text
-    _note(element, case.note)
-    if case.skipped:
-        ET.SubElement(element, "skipped", message=case.skipped)
 
 
 def _note(place: ET.Element, text: str) -> None:

@@ -59,7 +59,12 @@ def claimed_domain() -> Iterator[int]:
     if given := os.environ.get("LIFECYCLE_TEST_DOMAINS", ""):
         first, _, last = given.partition("-")
         pool = range(int(first), int(last or first) + 1)
-    used = _processes_by_domain()
+    used: Counter[str] = Counter()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or is another user's
+            for each in (process / "environ").read_bytes().split(b"\0"):
+                if each.startswith(b"ROS_DOMAIN_ID="):
+                    used[each.partition(b"=")[2].decode(errors="replace")] += 1
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as claim:
         for domain in sorted(pool, key=lambda each: used[str(each)]):
             try:
@@ -71,17 +76,6 @@ def claimed_domain() -> Iterator[int]:
         pytest.fail(
             f"all test domains {tuple(pool)} are taken by other tests; see LIFECYCLE_TEST_DOMAINS"
         )
-
-
-def _processes_by_domain() -> Counter[str]:
-    """Count the processes of this user by the `ROS_DOMAIN_ID` that they were started with."""
-    found: Counter[str] = Counter()
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended, or is another user's
-            for each in (process / "environ").read_bytes().split(b"\0"):
-                if each.startswith(b"ROS_DOMAIN_ID="):
-                    found[each.partition(b"=")[2].decode(errors="replace")] += 1
-    return found
 
 
 class LifecycleSystem:
@@ -245,26 +239,20 @@ class LifecycleSystem:
 
     def sections(self) -> Iterator[tuple[str, str]]:
         """Yield what a failed test shows: titles and texts."""
-        yield (
-            f"verdict on {self.manifest.name}, domain {self.domain_id}",
-            _verdict_text(self.verdict),
-        )
+        verdict = self.verdict
+        lines = [str(verdict["verdict"])]
+        for each in verdict["findings"]:
+            lines.append(f"{each['outcome']} {each['rule']}: {each['subject']}: {each['message']}")
+            lines += [f"  {name}: {each[name]}" for name in ("at", "hint") if each.get(name)]
+        if run := verdict.get("run"):
+            lines.append(f"ended: {run['reason']} (exit code {run['exit_code']})")
+        yield f"verdict on {self.manifest.name}, domain {self.domain_id}", "\n".join(lines)
         said = (self.directory / "stderr").read_text(encoding="utf-8", errors="replace")
         if said.strip():
             yield "lifecycle up", said.rstrip("\n")
         names = [each["process"] for each in self.events if each["event"] == "log"]
         for name in dict.fromkeys(names):
             yield f"log of {name}", "\n".join(self.log(name)[-_LOG_LINES:])
-
-
-def _verdict_text(verdict: Mapping[str, Any]) -> str:
-    lines = [str(verdict["verdict"])]
-    for each in verdict["findings"]:
-        lines.append(f"{each['outcome']} {each['rule']}: {each['subject']}: {each['message']}")
-        lines += [f"  {name}: {each[name]}" for name in ("at", "hint") if each.get(name)]
-    if run := verdict.get("run"):
-        lines.append(f"ended: {run['reason']} (exit code {run['exit_code']})")
-    return "\n".join(lines)
 
 
 MakeSystem = Callable[..., LifecycleSystem]

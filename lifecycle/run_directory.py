@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from lifecycle import codec
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
@@ -201,11 +202,7 @@ def groups_of(pid: int) -> tuple[int, int]:
 def _status(pid: int) -> list[bytes] | None:
     """Return the fields of proc_pid_stat(5) that follow the command."""
     try:
-        descriptor = os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            text = os.read(descriptor, 4096)
-        finally:
-            os.close(descriptor)
+        text = Path(f"/proc/{pid}/stat").read_bytes()
     except (FileNotFoundError, ProcessLookupError):
         return None
     # The command is in parentheses and may hold any character; the state follows it.
@@ -260,9 +257,7 @@ class RunDirectory:
                 hint=f"end it first: lifecycle down {name}",
             ) from None
         except OSError as error:
-            if directory.previous is None:
-                directory.release()
-            directory._let_go()
+            directory.release(removes=directory.previous is None)
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise UsageError(
                     f"cannot write in run directory {str(directory.path)!r}: {error.strerror}",
@@ -298,11 +293,6 @@ class RunDirectory:
                 if self._lock is None:
                     os.close(lock)
 
-    def _let_go(self) -> None:
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
-
     @property
     def socket_path(self) -> Path:
         """Where `lifecycle down` and `status` reach the supervisor."""
@@ -314,8 +304,6 @@ class RunDirectory:
         Raises:
             OSError: it cannot be written.
         """
-        from lifecycle import codec
-
         known, self._children = self._children, {}
         for pid, name in processes.items():
             if pid in known:
@@ -341,45 +329,49 @@ class RunDirectory:
         (self.path / _RECORD_NAME).unlink(missing_ok=True)
         part.rename(self.path / _RECORD_NAME)
 
-    def release(self) -> None:
-        """Remove the directory and give up the lock; nothing of ours may run.
+    def release(self, *, removes: bool = True) -> None:
+        """Give up the lock, and remove the directory: nothing of ours may run then.
 
         A list of what is still programmed in networks stays, and with it the directory.
         """
         if self._lock is None:
             return
         with contextlib.suppress(FileNotFoundError):
-            for each in tuple(self.path.iterdir()):
+            for each in tuple(self.path.iterdir()) if removes else ():
                 # The lock last: who takes it must not find what is being removed.
                 if each.name not in (LEDGER_NAME, "lock"):
                     with contextlib.suppress(IsADirectoryError):
                         each.unlink(missing_ok=True)
-            (self.path / "lock").unlink(missing_ok=True)
+            if removes:
+                (self.path / "lock").unlink(missing_ok=True)
             # Another supervisor may have it by now, or it is not empty.
             with contextlib.suppress(OSError):
                 self.path.rmdir()
-        self._let_go()
+        os.close(self._lock)
+        self._lock = None
 
 
 def read_record(path: Path) -> RunRecord | None:
     """Return the record in a run directory; None if there is none that can be read."""
-    from lifecycle import codec
-
     # It may just take the place of the one before it.
     for name in (_RECORD_NAME, _PART_NAME, _RECORD_NAME):
         with contextlib.suppress(OSError, ValueError):
-            return codec.from_json(_regular(path / name), RunRecord, longest=_LONGEST_RECORD)
+            data = read_regular(path / name, _LONGEST_RECORD + 1, os.O_NOFOLLOW)
+            return codec.from_json(data, RunRecord, longest=_LONGEST_RECORD)
     return None
 
 
-def _regular(path: Path) -> bytes:
-    """Read a file, and no more than a record holds."""
-    # Not blocking: a pipe in its place might have no writer.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | _OURS)
+def read_regular(path: str | Path, most: int, flags: int = 0) -> bytes:
+    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
     with os.fdopen(descriptor, "rb") as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), str(path))
-        return file.read(_LONGEST_RECORD + 1)
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        return file.read(most)
 
 
 def is_held(path: Path) -> bool:

@@ -17,10 +17,9 @@ from typing import NamedTuple, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
-from lifecycle.cli.common import COMPLETE
+from lifecycle.cli.common import COMPLETE, say
 from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, did_you_mean, exhausted
-from lifecycle.printable import lines
 
 
 class Verb(NamedTuple):
@@ -265,7 +264,7 @@ def program() -> int:
         return main()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    code = own_streams(waits=verb != ["up"]).settled(main())
+    code = own_streams(waits=verb != ["up"])(main())
     if verb == ["up"]:
         # The interpreter takes a moment to end, and the reported result of the run is final.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -315,19 +314,19 @@ def _report(error: Exception) -> int:
         error.show()
         return ExitCode.USAGE
     if isinstance(error, LifecycleError):
-        click.echo(lines(str(error)), err=True)
+        say(str(error))
         return error.exit_code
     if (used_up := exhausted(error)) is not None:
-        click.echo(lines(str(used_up)), err=True)
+        say(str(used_up))
         return used_up.exit_code
     if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
         # Of another Python, most often: ROS 2 has its C extensions for one version only.
         version = sys.version.split()[0]
         message = f"cannot import rclpy with Python {version}: {error}; {_ros_hint()}"
-        click.echo(lines(" ".join(message.split())), err=True)
+        say(" ".join(message.split()))
         return ExitCode.USAGE
     import traceback
 
     traceback.print_exception(error)
-    click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)
+    say("this is a bug in lifecycle: please report it with the trace above")
     return ExitCode.INTERNAL

@@ -48,20 +48,14 @@ def assignments_argument(function: F) -> F:
 
 
 def _of_package(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[str, ...]:
-    """Take `PACKAGE FILE` for the file that a package has installed, as `ros2 launch` does."""
-    package = ctx.params.get("manifest")
-    if package is None or is_manifest(package) or not words or ":=" in words[0]:
-        return words
-    ctx.params["manifest"] = _installed(package, words[0])
-    return words[1:]
-
-
-def _installed(package: str, name: str) -> str:
-    """Return the only file of a name in the share directory of a package.
+    """Take `PACKAGE FILE` for the file that a package has installed, as `ros2 launch` does.
 
     Raises:
         UsageError: there is no such package, no such file in it, or several.
     """
+    package = ctx.params.get("manifest")
+    if package is None or is_manifest(package) or not words or ":=" in words[0]:
+        return words
     from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
 
     prefixes = search_prefixes()
@@ -71,15 +65,16 @@ def _installed(package: str, name: str) -> str:
         raise UsageError(f"cannot find a file or a package {package!r}", hint=hint)
     share = index.parents[3] / package  # of PREFIX/share/ament_index/resource_index/packages/NAME
     found = sorted(share.rglob("*.yaml"))
-    named = [str(each) for each in found if each.name == name]
+    named = [str(each) for each in found if each.name == words[0]]
     if len(named) != 1:
         known = [each.name for each in found if each.name.endswith(".lifecycle.yaml")]
         there = ", ".join(named or known) or "none"
         number = "several" if named else "no"
         raise UsageError(
-            f"cannot choose {name!r}: {number} such manifest in {str(share)!r}: {there}"
+            f"cannot choose {words[0]!r}: {number} such manifest in {str(share)!r}: {there}"
         )
-    return named[0]
+    ctx.params["manifest"] = named[0]
+    return words[1:]
 
 
 def format_option(*formats: str) -> Callable[[F], F]:
@@ -127,14 +122,13 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
     return values
 
 
-def run_commands_option(function: F) -> F:
-    """Add `--run-commands` to a verb that only looks at a manifest."""
-    return click.option(
-        "--run-commands",
-        is_flag=True,
-        help="Run the programs of $(command …), as `lifecycle up` does; without it what they would "
-        "write is left out, and said.",
-    )(function)
+run_commands_option = click.option(
+    "--run-commands",
+    is_flag=True,
+    help="Run the programs of $(command …), as `lifecycle up` does; without it what they would "
+    "write is left out, and said.",
+)
+"""`--run-commands` of a verb that only looks at a manifest."""
 
 
 def load_plan(
@@ -173,7 +167,7 @@ def load_plan(
         warnings = (*warnings, *found)
     if not quiet:
         for warning in warnings:
-            click.echo(lines(str(warning)), err=True)
+            say(str(warning))
     return build_plan(loaded.manifest, domain_id=domain_id)
 
 
@@ -246,6 +240,11 @@ def replace_text(path: Path, text: str) -> None:
         raise
 
 
+def say(text: str) -> None:
+    """Say something on standard error, printable: parts of it are what others have chosen."""
+    click.echo(lines(text), err=True)
+
+
 def terminal_width() -> int:
     """Return how many columns standard output has; 0 where it is no terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
@@ -282,9 +281,7 @@ def machine_option(help_: str) -> Callable[[F], F]:
     )
 
 
-def target_run(
-    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
-) -> Path:
+def target_run(target: str, assignments: tuple[str, ...], machine: str) -> Path:
     """Return the run directory that a target names: a manifest's, or a system's by name.
 
     A manifest that is no longer the one that runs is reported on stderr, and makes no difference.
@@ -293,16 +290,13 @@ def target_run(
         UsageError: no such run.
         ManifestError: the manifest cannot be loaded, so that its domain is not known.
     """
-    path, plan = target_plan(environment, target, assignments, machine)
+    path, plan = target_plan(target, assignments, machine)
     if plan is not None:
         from lifecycle.supervisor.control.protocol import differences
 
         if found := differences(path, plan):
             listed = "\n".join(found)
-            click.echo(
-                f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}",
-                err=True,
-            )
+            say(f"{plan.manifest_path} is not the manifest that {path.name} runs:\n{listed}")
     return path
 
 
@@ -327,7 +321,7 @@ def is_manifest(target: str) -> bool:
 
 
 def target_plan(
-    environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
+    target: str, assignments: tuple[str, ...], machine: str
 ) -> tuple[Path, Plan | None]:
     """Return the run directory that a target names, and the plan if it is a manifest.
 
@@ -337,7 +331,7 @@ def target_plan(
     """
     from lifecycle.run_directory import find_run, run_name, run_roots
 
-    roots = run_roots(environment)
+    roots = run_roots(os.environ)
     if not is_manifest(target):
         if assignments:
             raise UsageError(
@@ -347,26 +341,6 @@ def target_plan(
         return find_run(roots, target), None
     plan = load_plan(target, assignments, quiet=True)
     return find_run(roots, run_name(plan, machine)), plan
-
-
-def network_options(flag: str, help_: str) -> Callable[[F], F]:
-    """Add the option that chooses networks to program, what each needs, and what flows get."""
-    return _network(
-        click.option(flag, "targets", type=click.Choice(TARGETS), multiple=True, help=help_)
-    )
-
-
-def export_option(function: F) -> F:
-    """Add `--export`, and what exporting for a network needs."""
-    return _network(
-        click.option(
-            "--export",
-            "export_",
-            type=click.Choice(TARGETS),
-            help="Print the verified flows as rules, settings or request bodies of another system "
-            "instead.",
-        )
-    )(function)
 
 
 def read_networks(
@@ -391,9 +365,10 @@ def read_networks(
     return chosen, read_treatment(mapping, label_flows=flow_labels)
 
 
-def _network(first: Callable[[F], F]) -> Callable[[F], F]:
+def network_options(*names: str, help_: str, multiple: bool = False) -> Callable[[F], F]:
+    """Add the option that chooses networks, what each of them needs, and what flows get."""
     options = (
-        first,
+        click.option(*names, type=click.Choice(TARGETS), multiple=multiple, help=help_),
         click.option("--device", metavar="DEV", help="tc: the device, eth0."),
         click.option("--rate", metavar="RATE", help="tc: rate of the link behind it, 20mbit."),
         click.option(
@@ -440,62 +415,38 @@ def _network(first: Callable[[F], F]) -> Callable[[F], F]:
 COMPLETE = "_LIFECYCLE_COMPLETE"
 """Variable by which a shell asks what can come next (click's, by the program's name)."""
 
-Source = Callable[[click.Context], Iterable[str]]
-Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
 
-
-def completing(what: str) -> Completer:
-    """Return the shell completion of an argument: words of these kinds, see `_SOURCES`."""
+def completing(what: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
+    """Return the shell completion of an argument by words of these kinds, see `_words`."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[Any]:
-        if "manifests" in what and not incomplete.isidentifier() and incomplete:
-            return [CompletionItem(incomplete, type="file")]
-        words = [word for each in what.split() for word in _words(each, context)]
-        found = [CompletionItem(each) for each in words if each.startswith(incomplete)]
         files = [CompletionItem(incomplete, type="file")] if "manifests" in what else []
-        return found or files
+        if files and incomplete and not incomplete.isidentifier():
+            return files
+        words: list[str] = []
+        for kind in what.split():
+            with contextlib.suppress(Exception):  # what is half written has no completions
+                words += _words(kind, context)
+        return [CompletionItem(each) for each in words if each.startswith(incomplete)] or files
 
     return complete
 
 
 def _words(kind: str, context: click.Context) -> list[str]:
-    try:
-        return list(_SOURCES[kind](context))
-    except Exception:  # noqa: BLE001 - what is half written has no completions
-        return []
+    """Return "manifests" and "systems" here, "runs", or what the manifest before has of a kind."""
+    if kind == "manifests":
+        return sorted(each.name for each in Path().glob("*.lifecycle.yaml"))
+    if kind == "systems":
+        from lifecycle.run_directory import run_roots, running
 
+        return [each.name for each in running(*run_roots(os.environ))]
+    if kind == "runs":
+        from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
 
-def _manifests(_: click.Context) -> Iterable[str]:
-    return sorted(each.name for each in Path().glob("*.lifecycle.yaml"))
-
-
-def _systems(_: click.Context) -> Iterable[str]:
-    from lifecycle.run_directory import run_roots, running
-
-    return [each.name for each in running(*run_roots(os.environ))]
-
-
-def _runs(_: click.Context) -> Iterable[str]:
-    from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
-
-    return [each.name for each in runs_of(ros_log_root(os.environ), "")]
-
-
-def _mapping(context: click.Context, key: str) -> dict[str, Any]:
-    """Return what is under a key of the manifest that the words before name, as its text has it."""
+        return [each.name for each in runs_of(ros_log_root(os.environ), "")]
     import yaml
 
     target = context.params.get("manifest") or context.params.get("target") or ""
     with Path(str(target)).expanduser().open("rb") as stream:
         document = yaml.load(stream, Loader=yaml.BaseLoader)  # noqa: S506 - builds nothing but text
-    return dict(document[key])
-
-
-_SOURCES: dict[str, Source] = {
-    "manifests": _manifests,
-    "systems": _systems,
-    "nodes": lambda context: _mapping(context, "nodes"),
-    "machines": lambda context: _mapping(context, "machines"),
-    "arguments": lambda context: (f"{name}:=" for name in _mapping(context, "arguments")),
-    "runs": _runs,
-}
+    return [f"{name}:=" if kind == "arguments" else name for name in document[kind]]

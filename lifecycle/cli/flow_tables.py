@@ -22,7 +22,6 @@ from lifecycle.errors import UsageError
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement, Kind, Pair, measured_summary
 from lifecycle.network.dscp import describe, dscp_name, tos
-from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, lines, one_line, shown_length
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport, Verdict
@@ -130,23 +129,18 @@ def _rows(
         flow.effective_transport,
         flow.outcome.value,
     )
-    for each in _tuples(flow):
-        pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))
-        yield (*pair, *cells(measured, colour=colour), *rest)
-
-
-def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
-    """Source, destination, protocol and flow label of each network flow of a pair."""
-    found = [
+    found: list[tuple[str, ...]] = [
         (each.source, each.destination, each.transport_protocol.value, each.label or "–")
         for each in flow.tuples
     ]
-    return found or [(_ends(flow.source), _ends(flow.destination), "–", "–")]
-
-
-def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
-    """Write the network flow endpoints of an end that forms no IP flow with the other."""
-    return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
+    # An end that forms no IP flow with the other has its network flow endpoints.
+    ends = (
+        " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
+        for nfes in (flow.source, flow.destination)
+    )
+    for each in found or [(*ends, "–", "–")]:
+        pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))
+        yield (*pair, *cells(measured, colour=colour), *rest)
 
 
 COLUMNS: dict[str, Callable[[FlowReport, Any], object]] = {

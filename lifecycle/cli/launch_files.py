@@ -175,7 +175,14 @@ class _Walk:
         elif "RegisterEventHandler" in kinds:
             self._handler(entity.event_handler, notes)
         elif "LoadComposableNodes" in kinds:
-            self._components(entity, notes)
+            container = _private(entity, "target_container")
+            if _is_a(container, "Node"):
+                namespace = self._namespace(_private(container, "node_namespace"))
+                name = f"{namespace.rstrip('/')}/{self._text(_private(container, 'node_name'))}"
+            else:
+                name = f"/{self._text(container).removeprefix('/')}"
+            for each in _private(entity, "composable_node_descriptions") or ():
+                self._component(each, name, notes)
         elif "Node" in kinds:
             self._node(entity, kinds, notes)
         else:
@@ -211,7 +218,16 @@ class _Walk:
         )
         self._settings(node, _private(action, "parameters"), _private(action, "remappings"))
         self._ros_arguments(node, action)
-        self._respawn(node, action)
+        if self._is_true(_private(action, "respawn")):
+            node.restart["restart"] = "always"
+            delay_s = _private(action, "respawn_delay")
+            if isinstance(delay_s, (int, float)):
+                node.restart["restart_sec"] = delay_s
+            most = _private(action, "respawn_max_retries")
+            if isinstance(most, int) and most >= 0:
+                node.gaps.append(
+                    f"respawn_max_retries {most}: `start_limit_burst` counts starts within a time"
+                )
         if self._is_true(_private(action, "shell") or getattr(action, "shell", None)):
             node.gaps.append("shell: a manifest has nothing like it")
         if getattr(getattr(action, "process_description", None), "env", None):
@@ -221,19 +237,6 @@ class _Walk:
         self.found.nodes.append(node)
         for each in _private(action, "composable_node_descriptions") or ():
             self._component(each, node.full_name, notes)
-
-    def _respawn(self, node: LaunchedNode, action: Any) -> None:
-        if not self._is_true(_private(action, "respawn")):
-            return
-        node.restart["restart"] = "always"
-        delay_s = _private(action, "respawn_delay")
-        if isinstance(delay_s, (int, float)):
-            node.restart["restart_sec"] = delay_s
-        retries = _private(action, "respawn_max_retries")
-        if isinstance(retries, int) and retries >= 0:
-            node.gaps.append(
-                f"respawn_max_retries {retries}: `start_limit_burst` counts starts within a time"
-            )
 
     def _is_true(self, value: Any) -> bool:
         return value is not None and self._text(value).lower() in ("true", "1")
@@ -335,17 +338,6 @@ class _Walk:
                 node.gaps.append(f"ROS argument {' '.join(filter(None, (word, value)))}")
 
     # -- components
-
-    def _components(self, action: Any, notes: tuple[str, ...]) -> None:
-        target = _private(action, "target_container")
-        if _is_a(target, "Node"):
-            namespace = self._namespace(_private(target, "node_namespace"))
-            container = f"{namespace.rstrip('/')}/{self._text(_private(target, 'node_name'))}"
-        else:
-            container = self._text(target)
-            container = container if container.startswith("/") else f"/{container}"
-        for each in _private(action, "composable_node_descriptions") or ():
-            self._component(each, container, notes)
 
     def _component(self, described: Any, container: str, notes: tuple[str, ...]) -> None:
         if not self._holds(described.condition()):

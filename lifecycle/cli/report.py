@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import replace
 
-from lifecycle.cli.common import replace_text, unwritable
+from lifecycle.cli.common import replace_text, say, unwritable
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
-from lifecycle.printable import count, lines
+from lifecycle.printable import count
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
@@ -76,7 +76,7 @@ def write_report(path: Path, text: str) -> ExitCode:
     try:
         _replace(path, text)
     except UsageError as error:
-        click.echo(lines(str(error)), err=True)
+        say(str(error))
         return ExitCode.USAGE
     return ExitCode.OK
 

@@ -19,9 +19,9 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, NoReturn, TextIO, cast
 
 import click
@@ -52,10 +52,16 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class _Raw(io.RawIOBase):
-    """The raw end of a stream to a descriptor."""
+    """The raw end of a stream: what a Writer takes, else writes until that fails and none then.
 
-    def __init__(self, descriptor: int) -> None:
+    Attributes:
+        error: why it failed.
+    """
+
+    def __init__(self, descriptor: int, writer: Writer | None = None) -> None:
         self._descriptor = descriptor
+        self._writer = writer
+        self.error: OSError | None = None
 
     def writable(self) -> bool:
         return True
@@ -66,21 +72,12 @@ class _Raw(io.RawIOBase):
     def isatty(self) -> bool:
         return os.isatty(self._descriptor)
 
-
-class _Tolerant(_Raw):
-    """Writes to a descriptor until that fails, and nothing from then on.
-
-    Attributes:
-        error: why it failed.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        super().__init__(descriptor)
-        self.error: OSError | None = None
-
     def write(self, data: ReadableBuffer) -> int:
         left = memoryview(data).cast("B")
         size = len(left)
+        if self._writer is not None:
+            self._writer.put(bytes(left).decode(errors="replace"), kept=False)
+            return size
         try:
             while left and self.error is None:
                 left = left[_write_some(self._descriptor, left) :]
@@ -89,51 +86,40 @@ class _Tolerant(_Raw):
         return size
 
 
-class Streams:
-    """The standard streams of this process, see `own_streams`."""
-
-    def __init__(self, stdout: _Tolerant, stderr: Writer | None) -> None:
-        self._stdout = stdout
-        self._stderr = stderr
-
-    def settled(self, code: int) -> int:
-        """Write what is left and return the exit code: no success if its result was lost.
-
-        A reader that went away, as `head` does, has read what it wanted.
-        """
-        sys.stdout.flush()
-        error = self._stdout.error
-        if error is not None and error.errno in _FULL:
-            sys.stderr.write(f"cannot write standard output: {error.strerror}\n")
-            code = code or ExitCode.USAGE
-        sys.stderr.flush()
-        if self._stderr is not None:
-            self._stderr.close()
-        return code
-
-
-def own_streams(*, waits: bool = True) -> Streams:
+def own_streams(*, waits: bool = True) -> Callable[[int], int]:
     """Have only `sys.stdout` write to standard output, and no failure of it or stderr raise.
 
     What writes to descriptor 1 itself, as C++ does, comes out on standard error; so does what child
     processes print that are given no other. A stream that is closed becomes one to nowhere. Unless
     it `waits`, what readers of standard error do not read in time is dropped.
+
+    Returns:
+        What writes the rest and returns the exit code in the end: no success if the result was
+        lost. A reader that went away, as `head` does, has read what it wanted.
     """
     _open_closed()
-    stdout = _Tolerant(os.dup(_STDOUT))
+    stdout = _Raw(os.dup(_STDOUT))
     _replace("stdout", io.BufferedWriter(stdout))
     stderr = os.dup(_STDERR)
     writer = None
     if not waits:
         with contextlib.suppress(MiddlewareError):  # the verb will say so
-            writer = Writer(stderr, "standard error", marker=lambda text: f"{text}\n")
-    if writer is None:
-        _replace("stderr", _Tolerant(stderr))
-    else:
-        _replace("stderr", _Queued(writer))
-        _never_wait(_STDERR)
+            writer = Writer(stderr, "standard error", marker="{}\n".format)
+            _never_wait(_STDERR)
+    _replace("stderr", _Raw(stderr, writer))
     os.dup2(_STDERR, _STDOUT)
-    return Streams(stdout, writer)
+
+    def settled(code: int) -> int:
+        sys.stdout.flush()
+        if stdout.error is not None and stdout.error.errno in _FULL:
+            sys.stderr.write(f"cannot write standard output: {stdout.error.strerror}\n")
+            code = code or ExitCode.USAGE
+        sys.stderr.flush()
+        if writer is not None:
+            writer.close()
+        return code
+
+    return settled
 
 
 def echo_while_read(text: str) -> None:
@@ -144,7 +130,7 @@ def echo_while_read(text: str) -> None:
     """
     click.echo(text)
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
-    if isinstance(raw, _Tolerant) and raw.error is not None:
+    if isinstance(raw, _Raw) and raw.error is not None:
         raise click.exceptions.Exit(ExitCode.OK)
 
 
@@ -224,7 +210,7 @@ class Writer:
         say: Callable[[str], object] = lambda _: None,
         encoding: str = "utf-8",
     ) -> None:
-        self.descriptor = descriptor
+        self._descriptor = descriptor
         self._name = name
         self._marker = marker
         self._say = say
@@ -235,7 +221,6 @@ class Writer:
         self._bytes = 0
         self._lost = 0
         self._full = ""  # why the disk takes nothing
-        self._said_full = False
         self._gone = False
         self._closing = False
         self._progress = 0
@@ -301,7 +286,7 @@ class Writer:
             self._append(note.encode(self._encoding, "backslashreplace"), lost)
 
     def _run(self) -> None:
-        torn = b""
+        torn, said_full = b"", False
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._gone or self._closing or self._queue)
@@ -309,57 +294,38 @@ class Writer:
                     return
                 text, number = self._queue[0]
             left = memoryview(torn + text)
-            error = None
+            message = full = ""
+            gone = False
             try:
                 while left:
-                    left = left[_write_some(self.descriptor, left[:_CHUNK_BYTES]) :]
+                    left = left[_write_some(self._descriptor, left[:_CHUNK_BYTES]) :]
                     torn = b"\n" if left else b""
                     self._progress += 1
-            except OSError as failed:
-                error = failed
+            except OSError as error:
+                gone, full = error.errno not in _FULL, str(error.strerror)
+            if gone:
+                message = f"{self._name} was closed by its reader; the run goes on without it"
+            elif full and not said_full:
+                said_full = True
+                message = (
+                    f"cannot write {self._name}: {full}; the run goes on, and what is lost is "
+                    "counted"
+                )
             with self._changed:
                 self._queue.popleft()
                 self._bytes -= len(text)
-                if error is None:
-                    self._full = ""
+                self._gone |= gone
+                self._full = full
+                if full:
+                    self._lost += number
+                else:
                     self._note_lost()
-            if error is not None:
-                self._failed(error, number)
-
-    def _failed(self, error: OSError, lost: int) -> None:
-        with self._changed:
-            if error.errno not in _FULL:
-                self._gone = True
-                self._queue.clear()
-                message = f"{self._name} was closed by its reader; the run goes on without it"
-            else:
-                self._full = error.strerror or "the disk is full"
-                self._lost += lost
-                if self._said_full:
-                    return
-                self._said_full = True
-                message = (
-                    f"cannot write {self._name}: {self._full}; the run goes on, and what is lost "
-                    "is counted"
-                )
-        self._say(message)
+            if message:
+                self._say(message)
 
 
 def _lines_are(number: int) -> str:
     return f"{count(number, 'line')} {'is' if number == 1 else 'are'}"
-
-
-class _Queued(_Raw):
-    """The raw end of a stream that a Writer writes."""
-
-    def __init__(self, writer: Writer) -> None:
-        super().__init__(writer.descriptor)
-        self._writer = writer
-
-    def write(self, data: ReadableBuffer) -> int:
-        whole = bytes(data)
-        self._writer.put(whole.decode(errors="replace"), kept=False)
-        return len(whole)
 
 
 # XTerm Control Sequences: the alternate screen, the cursor, and lines that end at the edge.
@@ -367,53 +333,48 @@ _BEGIN, _END = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
 _HOME, _ERASE_LINE, _ERASE_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 
 
-class Watched:
-    """Shows one text after another; use it in a `with`, in the main thread. Ctrl-C ends it.
+@contextlib.contextmanager
+def watched(*, whole: bool = True) -> Iterator[Callable[[str], None]]:
+    """Give what shows one text in the place of the last, in the main thread. Ctrl-C ends it.
 
     What does not fit on the terminal is cut off. The last text stays on the ordinary screen.
 
     Args:
         whole: False where each text belongs behind the other on a terminal, too, as JSON does.
     """
+    last = ""
 
-    def __init__(self, *, whole: bool = True) -> None:
-        self._whole = whole and sys.stdout is not None and sys.stdout.isatty()
-        self._last = ""
+    def follow(text: str) -> None:
+        nonlocal last
+        if text.rstrip("\n") != last:
+            last = text.rstrip("\n")
+            echo_while_read(last)
 
-    def show(self, text: str) -> None:
-        """Show a text in the place of the last one, unless it is the same."""
-        if text.rstrip("\n") == self._last:
-            return
-        self._last = text.rstrip("\n")
-        if not self._whole:
-            echo_while_read(self._last)
-            return
-        rows = [f"{_ERASE_LINE}{row}" for row in self._last.split("\n")]
+    if not whole or sys.stdout is None or not sys.stdout.isatty():
+        yield follow
+        return
+
+    def write(text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+    def show(text: str) -> None:
+        nonlocal last
+        last = text.rstrip("\n")
+        rows = [f"{_ERASE_LINE}{row}" for row in last.split("\n")]
         height = shutil.get_terminal_size().lines
         if len(rows) < height:
             rows.append(_ERASE_BELOW)
-        self._write(_HOME + "\n".join(rows[:height]))
+        write(_HOME + "\n".join(rows[:height]))
 
-    def __enter__(self) -> Watched:  # noqa: PYI034 - typing.Self is not in Python 3.10
-        if self._whole:
-            for number in (signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, _end)
-            self._write(_BEGIN)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._whole:
-            self._write(_END)
-            echo_while_read(self._last)
-
-    def _write(self, text: str) -> None:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _end)
+    write(_BEGIN)
+    try:
+        yield show
+    finally:
+        write(_END)
+        echo_while_read(last)
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:

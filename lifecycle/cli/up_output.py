@@ -4,46 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 
-import click
-
+from lifecycle.cli.common import say
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.verbs.control import status_head
 from lifecycle.node.host.control import Operation
 from lifecycle.printable import count, json_text, log_line, one_line
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
-from lifecycle.supervisor.run.events import (
-    ConsequenceTaken,
-    Event,
-    Failure,
-    GateOpened,
-    GaveUp,
-    LogLine,
-    MachineConnection,
-    ManifestApplied,
-    ModeEntered,
-    NodeAlive,
-    NodeChanged,
-    NodeSilent,
-    Notice,
-    ProcessChanged,
-    RequestSent,
-    Restarted,
-    RestartScheduled,
-    RunStarted,
-    Stopped,
-    Stopping,
-    SystemReached,
-    VerdictChanged,
-    WiringChanged,
-    WiringLost,
-    to_record,
-)
+from lifecycle.supervisor.run import events
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.judge import missing, not_ok
 from lifecycle.verify.outcome import Outcome
@@ -53,24 +25,6 @@ from lifecycle.verify.verdict import Stage, Verdict
 _AGAIN_S = 1.0
 
 
-class RunOutput:
-    """A listener that also shows how the run ended."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-
-    def __call__(self, event: Event) -> None:
-        """Show one event."""
-        raise NotImplementedError
-
-    def watch(self, status: Callable[[], SystemStatus]) -> None:
-        """Take the way to ask for the status, once there is something to show; lines need none."""
-
-    def finish(self, result: UpResult) -> None:
-        """Show the result, and return once that is written or not taken."""
-        raise NotImplementedError
-
-
 @contextlib.contextmanager
 def output(format_: str) -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
@@ -78,39 +32,40 @@ def output(format_: str) -> Iterator[RunOutput]:
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
-    marker = _json_notice if format_ == "json" else "{}\n".format
-    is_terminal = format_ != "json" and sys.stdout.isatty()
+    marker: Callable[[str], str] = "{}\n".format
+    kind: type[RunOutput] = PlainLines
+    if format_ == "json":
+        marker, kind = (lambda text: _json_line(events.Notice(message=text))), JsonLines
+    elif sys.stdout.isatty():
+        marker, kind = "\r\x1b[K{}\n".format, TerminalLines
     writer = Writer(
         sys.stdout.fileno(),
         "standard output",
-        marker="\r\x1b[K{}\n".format if is_terminal else marker,
-        say=functools.partial(click.echo, err=True),
+        marker=marker,
+        say=say,
         encoding=sys.stdout.encoding,
     )
     with contextlib.closing(writer):
-        if format_ == "json":
-            yield JsonLines(writer)
-        elif is_terminal:
-            yield TerminalLines(writer)
-        else:
-            yield PlainLines(writer)
+        yield kind(writer)
 
 
-def _json_line(event: Event) -> str:
-    record = json.dumps(to_record(event), ensure_ascii=False, separators=(",", ":"))
+def _json_line(event: events.Event) -> str:
+    record = json.dumps(events.to_record(event), ensure_ascii=False, separators=(",", ":"))
     return json_text(record) + "\n"
 
 
-def _json_notice(text: str) -> str:
-    return _json_line(Notice(message=text))
-
-
-class JsonLines(RunOutput):
+class JsonLines:
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
-    def __call__(self, event: Event) -> None:
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+
+    def watch(self, _: Callable[[], SystemStatus]) -> None:
+        """Have the way to ask for the status; events say enough."""
+
+    def __call__(self, event: events.Event) -> None:
         """Write one event."""
-        self._writer.put(_json_line(event), kept=not isinstance(event, LogLine))
+        self._writer.put(_json_line(event), kept=not isinstance(event, events.LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict."""
@@ -132,18 +87,18 @@ class Narrator:
         self._failed: set[str] = set()
         self._ended: set[str] = set()
 
-    def line(self, event: Event) -> str | None:
+    def line(self, event: events.Event) -> str | None:
         """Return the line about the next event; None if it has none."""
-        if isinstance(event, Failure) and event.ends_run:
+        if isinstance(event, events.Failure) and event.ends_run:
             self._failed.add(event.process)
-        elif isinstance(event, ProcessChanged) and event.state is ProcessState.STOPPING:
+        elif isinstance(event, events.ProcessChanged) and event.state is ProcessState.STOPPING:
             self._ended.add(event.process)
-        elif isinstance(event, LogLine) and self._failed:
+        elif isinstance(event, events.LogLine) and self._failed:
             buries = event.process in self._ended - self._failed
             return None if buries else describe(event)
-        if isinstance(event, RequestSent):
+        if isinstance(event, events.RequestSent):
             self._asked.add(event.node)
-        if isinstance(event, NodeChanged):
+        if isinstance(event, events.NodeChanged):
             before = self._reached.get(event.node)
             self._reached[event.node] = event.reach
             if before is not event.reach:
@@ -157,23 +112,26 @@ _LOST = ("unconfigured", "inactive", "finalized", "errorprocessing")
 """States (lifecycle_msgs/State) to which somebody else has brought a node that is to be active."""
 
 
-class PlainLines(RunOutput):
+class PlainLines:
     """One line per event, for logs and pipes."""
 
     def __init__(self, writer: Writer, *, colour: bool = False, width: int = 100) -> None:
-        super().__init__(writer)
+        self._writer = writer
         self._colour = colour
         self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
 
-    def __call__(self, event: Event) -> None:
+    def watch(self, status: Callable[[], SystemStatus]) -> None:
+        """Take the way to ask for the status, once there is something to show; lines need none."""
+
+    def __call__(self, event: events.Event) -> None:
         """Write one event, if it has a line for people."""
         line = self._narrator.line(event)
-        if isinstance(event, SystemReached):
+        if isinstance(event, events.SystemReached):
             self._active = event.reached == "active"
-        if isinstance(event, VerdictChanged):
+        if isinstance(event, events.VerdictChanged):
             if event.stage is Stage.ACTIVE and not self._active and missing(event.verdict):
                 # Not a system that broke: nodes become active one by one, and host by host.
                 line = one_line(f"not active yet; {missing(event.verdict)}")
@@ -182,7 +140,7 @@ class PlainLines(RunOutput):
                 return
             self._judged = line
         if line is not None:
-            self._put(line + "\n", kept=not isinstance(event, LogLine))
+            self._put(line + "\n", kept=not isinstance(event, events.LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
@@ -216,9 +174,9 @@ class TerminalLines(PlainLines):
 
         again()
 
-    def __call__(self, event: Event) -> None:
+    def __call__(self, event: events.Event) -> None:
         """Write one event, and what is going on since."""
-        if isinstance(event, SystemReached | VerdictChanged | Stopping):
+        if isinstance(event, events.SystemReached | events.VerdictChanged | events.Stopping):
             self._look()
         super().__call__(event)
 
@@ -237,97 +195,101 @@ class TerminalLines(PlainLines):
         self._writer.put(f"\r\x1b[K{text}{self._below}\r", kept=kept)
 
 
-def describe(event: Event) -> str | None:
+RunOutput = JsonLines | PlainLines
+"""What shows a run: a listener that also shows how it ended, by `finish`."""
+
+
+def describe(event: events.Event) -> str | None:
     """Return the line about `event` for people, printable; None if it has none."""
-    if isinstance(event, LogLine):
+    if isinstance(event, events.LogLine):
         return log_line(f"[{event.process}] {event.line}")
     text = _sentence(event)
     return None if text is None else one_line(text)
 
 
-def _sentence(event: Event) -> str | None:  # noqa: PLR0911, PLR0912 - one case for each kind
+def _sentence(event: events.Event) -> str | None:  # noqa: PLR0911, PLR0912 - one case for each kind
     match event:
-        case RunStarted():
+        case events.RunStarted():
             return (
                 f"{event.system}: {count(len(event.nodes), 'node')} in "
                 f"{count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
                 f"discovery range {event.discovery_range}; logs in {event.log_directory}"
             )
-        case ProcessChanged():
+        case events.ProcessChanged():
             pid = f" (pid {event.pid})" if event.pid else ""
             detail = f", {event.detail}" if event.detail else ""
             return f"process {event.process}: {event.state.value}{pid}{detail}"
-        case NodeChanged():
+        case events.NodeChanged():
             but = f", but {event.state}" if _is_lost(event) else ""
             return f"{event.node}: {event.reach.value}{but}"
-        case WiringChanged():
+        case events.WiringChanged():
             return _wiring_changed(event)
-        case WiringLost():
+        case events.WiringLost():
             what = f"{event.endpoint} on " if event.endpoint else ""
             return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
-        case NodeSilent():
+        case events.NodeSilent():
             return f"{event.node}: silent; {event.message}"
-        case NodeAlive(there=True):
+        case events.NodeAlive(there=True):
             return f"{event.node}: alive again after {event.silent_s:.1f} s"
-        case NodeAlive():
+        case events.NodeAlive():
             after = f"not silent any more after {event.silent_s:.1f} s"
             return f"{event.node}: {after}, but not there yet"
-        case MachineConnection(established=True):
+        case events.MachineConnection(established=True):
             again = f" again after {event.lost_s:.1f} s" if event.lost_s else ""
             return f"machine {event.machine}: connected{again}"
-        case MachineConnection():
+        case events.MachineConnection():
             what = "was shut down by its supervisor" if event.left else "connection lost"
             return f"machine {event.machine}: {what}"
-        case VerdictChanged():
+        case events.VerdictChanged():
             waits = missing(event.verdict)
             if waits and event.stage is Stage.CONNECTED:
                 return f"not verified yet; {waits}"
             return f"{event.stage.value}: {verdict_line(event.verdict)}"
-        case GateOpened():
+        case events.GateOpened():
             trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
             activating = f"activating {count(len(event.nodes), 'node')}"
             return f"gate open on verdict {event.outcome}: {activating}{trusted}"
-        case SystemReached():
+        case events.SystemReached():
             return f"system {event.reached} after {event.elapsed_s:.2f} s"
-        case Failure():
+        case events.Failure():
             # What ends the run comes first in the last verdict; once is enough.
             named = f"failed: {event.subject} ({event.rule})"
             return named if event.ends_run else f"{named}: {event.message}"
-        case RestartScheduled():
+        case events.RestartScheduled():
             last = f"; its last line: {event.stderr}" if event.stderr else ""
             others = len(event.nodes) - 1
             with_it = f" with {count(others, 'other node')}" if others else ""
             return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
-        case Restarted():
+        case events.Restarted():
             return (
                 f"{event.process} is back {event.took_s:.2f} s after its failure; "
                 f"restarted {count(event.restarts, 'time')}"
             )
-        case GaveUp():
+        case events.GaveUp():
             return f"gave up {event.process} after {count(len(event.history), 'failure')}"
-        case ConsequenceTaken():
+        case events.ConsequenceTaken():
             whom = f" {', '.join(event.nodes)}" if event.nodes else ""
             return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
-        case ModeEntered():
+        case events.ModeEntered():
             without = f", without {', '.join(event.inactive)}" if event.inactive else ""
             given = ", ".join(event.parameters)
             return f"mode {event.mode}{without}{f', other parameters of {given}' if given else ''}"
-        case ManifestApplied():
+        case events.ManifestApplied():
             return _manifest_applied(event)
-        case Notice():
+        case events.Notice():
             return event.message
-        case Stopping():
+        case events.Stopping():
             return f"stopping: {event.reason}"
-        case Stopped():
+        case events.Stopped():
             return f"stopped after {event.elapsed_s:.2f} s"
     return None
 
 
-def _is_lost(event: NodeChanged) -> bool:
+def _is_lost(event: events.NodeChanged) -> bool:
     return event.reach is Reach.ACTIVE and event.state in _LOST
 
 
-def _wiring_changed(event: WiringChanged) -> str:
+def _wiring_changed(event: events.WiringChanged) -> str:
     again = f" (try {event.attempt})" if event.attempt > 1 else ""
     if event.error:
         return event.error + again
@@ -339,7 +301,7 @@ def _wiring_changed(event: WiringChanged) -> str:
     return f"{event.node}: disconnected from {event.connection}"
 
 
-def _manifest_applied(event: ManifestApplied) -> str:
+def _manifest_applied(event: events.ManifestApplied) -> str:
     what = {
         "added": event.added,
         "removed": event.removed,

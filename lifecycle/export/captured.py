@@ -496,7 +496,11 @@ def _is_own(parameter: CapturedParameter) -> bool:
 
 
 def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> CapturedEndpoint:
-    report = _report_of(endpoint, reports)
+    same = [
+        each for each in reports if each.kind is endpoint.kind and endpoint.name == each.resolved
+    ]
+    exact = [each for each in same if each.gid and each.gid == endpoint.gid]
+    report = next(iter([*exact, *same]), None)
     qos = endpoint.qos
     reported = report.qos if report else None
     if qos is not None and reported is not None and qos.history is History.UNKNOWN:
@@ -512,16 +516,6 @@ def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> 
         # 0 is unmarked.
         dscp=(report.dscp or None) if report else None,
     )
-
-
-def _report_of(
-    endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]
-) -> EndpointReport | None:
-    same = [
-        each for each in reports if each.kind is endpoint.kind and endpoint.name == each.resolved
-    ]
-    exact = [each for each in same if each.gid and each.gid == endpoint.gid]
-    return next(iter([*exact, *same]), None)
 
 
 _KINDS = list(EndpointKind)

@@ -41,11 +41,11 @@ _USER = 1000
 _LONGEST_NAME = 63
 
 _USELESS = (
-    ExitCode.USAGE,
-    ExitCode.MANIFEST_INVALID,
-    ExitCode.VIOLATED,
-    ExitCode.UNVERIFIABLE,
-    ExitCode.SUPERVISION_GAVE_UP,
+    ExitCode.USAGE.value,
+    ExitCode.MANIFEST_INVALID.value,
+    ExitCode.VIOLATED.value,
+    ExitCode.UNVERIFIABLE.value,
+    ExitCode.SUPERVISION_GAVE_UP.value,
 )
 """Exit codes after which the same command would end the same way, or that say so themselves."""
 
@@ -152,7 +152,7 @@ def systemd(deployment: Deployment) -> dict[str, str]:
 
 
 def _systemd_unit(deployment: Deployment, machine: str) -> str:
-    name = deployment.name(machine)
+    name, restarts = deployment.name(machine), deployment.restarts(machine)
     allowed = "CAP_NET_ADMIN" if deployment.programs_networks else ""
     service: list[tuple[str, object]] = [
         ("Type", "notify"),
@@ -163,7 +163,11 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         # SIGTERM to the supervisor alone, which takes its nodes down in order.
         ("KillMode", "mixed"),
         ("WatchdogSec", WATCHDOG_S),
-        *_systemd_restart(deployment, machine),
+        # Nodes are restarted by the supervisor, or all of it by systemd, never both. One that is
+        # killed, or hangs, cannot restart anything: that is systemd's in any case.
+        ("Restart", "on-abnormal" if restarts else "on-failure"),
+        *([] if restarts else [("RestartPreventExitStatus", " ".join(map(str, _USELESS)))]),
+        ("RestartSec", 2),
         ("RuntimeDirectory", name),
         ("StateDirectory", name),
         ("Environment", f"XDG_RUNTIME_DIR=%t/{name}"),
@@ -192,35 +196,6 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         for name, entries in sections.items()
     ]
     return _head(deployment, machine) + "\n".join(parts)
-
-
-def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
-    """What is restarted by whom: nodes by the supervisor, or all of it by systemd; never both.
-
-    A supervisor that is killed, or hangs, cannot restart anything: that is systemd's in any case.
-    """
-    if deployment.restarts(machine):
-        yield "Restart", "on-abnormal"
-    else:
-        yield "Restart", "on-failure"
-        yield "RestartPreventExitStatus", " ".join(str(int(each)) for each in _USELESS)
-    yield "RestartSec", 2
-
-
-def _refuse_resources(deployment: Deployment, machine: str) -> None:
-    """Refuse a part whose supervisor is to limit processes, which it cannot in a container.
-
-    Raises:
-        UsageError: it is to.
-    """
-    for name, resources in deployment.limited(machine):
-        raise UsageError(
-            f"{resources.at.spelled}: cannot give process {name!r} its 'run.resources' in a "
-            "container of Kubernetes: systemd limits what a process may use, "
-            "and does not run there",
-            hint="leave 'resources' out and limit the whole container (resources.limits), or write "
-            "a unit: lifecycle export systemd",
-        )
 
 
 _ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the container's own
@@ -264,7 +239,14 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
 
 
 def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
-    _refuse_resources(deployment, machine)
+    for name, resources in deployment.limited(machine):  # as the supervisor cannot do there
+        raise UsageError(
+            f"{resources.at.spelled}: cannot give process {name!r} its 'run.resources' in a "
+            "container of Kubernetes: systemd limits what a process may use, "
+            "and does not run there",
+            hint="leave 'resources' out and limit the whole container (resources.limits), or write "
+            "a unit: lifecycle export systemd",
+        )
 
     def probe(what: str, failures: int) -> dict[str, object]:
         return {
@@ -353,12 +335,13 @@ def _dns_label(text: str) -> str:
 
 def _command(words: tuple[str, ...]) -> str:
     """Return a command line as systemd.service(5) reads it; `%` and `$` stand for themselves."""
-    return " ".join(map(_word, words))
-
-
-def _word(word: str) -> str:
-    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
-    # A line break would end the command, and begin a setting of its own.
-    escaped = re.sub(r"[\x01-\x1f\x7f]", lambda sign: f"\\x{ord(sign[0]):02x}", escaped)
-    plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
-    return escaped if plain else f'"{escaped}"'
+    said = []
+    for word in words:
+        escaped = (
+            word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+        )
+        # A line break would end the command, and begin a setting of its own.
+        escaped = re.sub(r"[\x01-\x1f\x7f]", lambda sign: f"\\x{ord(sign[0]):02x}", escaped)
+        plain = re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", escaped)
+        said.append(escaped if plain else f'"{escaped}"')
+    return " ".join(said)

@@ -25,12 +25,7 @@ from lifecycle.export.captured import (
     is_finite,
 )
 from lifecycle.export.programs import CapturedRun
-from lifecycle.manifest.model import (
-    DiscoveryRange,
-    EndpointKind,
-    RosArguments,
-    TargetState,
-)
+from lifecycle.manifest.model import DiscoveryRange, EndpointKind, RosArguments, TargetState
 from lifecycle.manifest.names import expand
 from lifecycle.manifest.qos import INFINITE_NS, History, QosProfile
 from lifecycle.network.dscp import describe

@@ -117,7 +117,15 @@ def picture_to_mermaid(picture: Picture) -> str:
         lines.append(f"  {edge}")
         if dash := DASHES.get(presence):
             styles.append(f"  linkStyle {number} stroke:{LINES[presence]},stroke-dasharray:{dash}")
-    return "\n".join([*lines, *styles, *_classes(picture)]) + "\n"
+    classes = []
+    for name, node in {_class(node): node for node in picture.nodes}.items():
+        look, dash = STATES[node.state], DASHES.get(node.presence)
+        dashed = f",stroke-width:2px,stroke-dasharray:{dash}" if dash else ""
+        colour = LINES[node.presence]
+        classes.append(
+            f"  classDef {name} fill:{look.fill},color:{look.ink},stroke:{colour}{dashed}"
+        )
+    return "\n".join([*lines, *styles, *classes]) + "\n"
 
 
 def _node(ids: dict[str, str], node: PicturedNode) -> str:
@@ -148,14 +156,6 @@ def _edges(picture: Picture, ids: dict[str, str]) -> Iterator[tuple[str, Presenc
 def _class(node: PicturedNode) -> str:
     state = node.state.name.lower()
     return f"{node.presence.value}_{state}" if node.presence in DASHES else state
-
-
-def _classes(picture: Picture) -> Iterator[str]:
-    for name, node in {_class(node): node for node in picture.nodes}.items():
-        look, dash = STATES[node.state], DASHES.get(node.presence)
-        dashed = f",stroke-width:2px,stroke-dasharray:{dash}" if dash else ""
-        colour = LINES[node.presence]
-        yield f"  classDef {name} fill:{look.fill},color:{look.ink},stroke:{colour}{dashed}"
 
 
 def _quoted(*said: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import msgspec
@@ -105,7 +105,11 @@ def run_of(
     if "--ros-args" not in program.argv:
         return replace(run, ros_args=RosArguments.AUTO, names=True) if made_up else run
     taken = _taken_apart(run, node, parameters)
-    if taken is None or not _resolves(taken, node, endpoints):
+    # Every endpoint has to get its name of now when the manifest's remaps are applied.
+    if taken is None or any(
+        _resolve(taken, node, kind, declared_name(taken, node, kind, name)) != name
+        for kind, name in endpoints
+    ):
         return run
     return replace(taken, names=taken.names or made_up)
 
@@ -162,14 +166,6 @@ def _with_file(run: CapturedRun, word: str) -> CapturedRun:
     return replace(run, gaps=(*run.gaps, gap))
 
 
-def _resolves(run: CapturedRun, node: str, endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:
-    """Whether every endpoint gets its name of now when the manifest's remaps are applied."""
-    return all(
-        _resolve(run, node, kind, declared_name(run, node, kind, name)) == name
-        for kind, name in endpoints
-    )
-
-
 def declared_name(run: CapturedRun, node: str, kind: EndpointKind, name: str) -> str:
     """Return the name that a node uses for an endpoint; the full one where that is not known."""
     for source, _ in run.remap:
@@ -192,15 +188,11 @@ def process_names(shared: Mapping[int, CapturedProgram], taken: Collection[str])
     """
     names: dict[int, str] = {}
     for pid, program in shared.items():
-        names[pid] = free_name(_stem(program.argv), {*names.values(), *taken})
+        # What its command line runs: the script or module of Python's, its file.
+        word, *others = program.argv
+        if re.match(r"python[\d.]*$", Path(word).name):
+            word = next((each for each in others if not each.startswith("-")), word)
+        stem = _WORD.sub("_", Path(word).name.removesuffix(".py")).strip("_")
+        stem = "process" if node_name_problem(stem) else stem
+        names[pid] = free_name(stem, {*names.values(), *taken})
     return names
-
-
-def _stem(argv: tuple[str, ...]) -> str:
-    """Return a word for what a command line runs: the script or module of Python's, its file."""
-    words = list(argv)
-    word = words[0]
-    if re.match(r"python[\d.]*$", Path(word).name) and len(words) > 1:
-        word = next((each for each in words[1:] if not each.startswith("-")), word)
-    stem = _WORD.sub("_", Path(word).name.removesuffix(".py")).strip("_")
-    return "process" if node_name_problem(stem) else stem

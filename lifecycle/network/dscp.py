@@ -69,11 +69,14 @@ def parse_dscp(value: str | int) -> int:
     number = value if isinstance(value, int) else _number(value.strip())
     if number is None:
         return _named(str(value))
-    if not 0 <= number <= MAX_DSCP:
-        raise ValueError(
-            f"cannot use DSCP {value}; use 0 to {MAX_DSCP} or a name such as EF{_tos_hint(number)}"
-        )
-    return number
+    if 0 <= number <= MAX_DSCP:
+        return number
+    hint = ""
+    if 0 <= number <= 0xFF:  # a TOS byte, most probably
+        name = f" ({_by_number()[number >> 2].name})" if number >> 2 in _by_number() else ""
+        ecn = " and sets ECN bits" if number & ECN_MASK else ""
+        hint = f"; {number} is a TOS byte{ecn}: DSCP {number >> 2}{name}"
+    raise ValueError(f"cannot use DSCP {value}; use 0 to {MAX_DSCP} or a name such as EF{hint}")
 
 
 def _number(text: str) -> int | None:
@@ -96,16 +99,6 @@ def _named(text: str) -> int:
     hint = f"; did you mean {nearest}?" if nearest else ""
     names = ", ".join(each.name for each in code_points())
     raise ValueError(f"cannot use {text!r} as DSCP; use 0 to {MAX_DSCP} or one of {names}{hint}")
-
-
-def _tos_hint(number: int) -> str:
-    """What a number beyond 63 probably meant."""
-    if not 0 <= number <= 0xFF:
-        return ""
-    dscp = number >> 2
-    name = f" ({_by_number()[dscp].name})" if dscp in _by_number() else ""
-    ecn = " and sets ECN bits" if number & ECN_MASK else ""
-    return f"; {number} is a TOS byte{ecn}: DSCP {dscp}{name}"
 
 
 def dscp_name(dscp: int) -> str:

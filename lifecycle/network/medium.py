@@ -61,11 +61,6 @@ class Medium(str, enum.Enum):
         return self.is_group or not self.is_network
 
     @property
-    def stays_in(self) -> str:
-        """Where its data stay, if no network sees them, as people read it; empty of others."""
-        return {Medium.SHM: "shared memory", Medium.INTRAPROCESS: "one process"}.get(self, "")
-
-    @property
     def connects(self) -> bool:
         """Whether connections are made of it, and connection URLs have it as their scheme."""
         return self not in (Medium.TCPV6, Medium.INTRAPROCESS)

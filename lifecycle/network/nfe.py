@@ -87,13 +87,10 @@ def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
     apart = same_machine is False
     if one.is_unspecified or other.is_unspecified:
         return not apart
-    local = one.is_loopback or one.is_link_local
-    return _equal(one, other) and not (local and apart)
-
-
-def _equal(one: IpAddress, other: IpAddress) -> bool:
-    """Equal, an IPv6 zone counting only where both name one."""
+    if apart and (one.is_loopback or one.is_link_local):
+        return False
     if isinstance(one, ipaddress.IPv6Address) and isinstance(other, ipaddress.IPv6Address):
+        # A zone counts only where both name one.
         zones_differ = one.scope_id and other.scope_id and one.scope_id != other.scope_id
         return one.packed == other.packed and not zones_differ
     return one == other
@@ -300,19 +297,17 @@ def flow_tuples(
 def _senders_to(
     end: NetworkFlowEndpoint, senders: Sequence[NetworkFlowEndpoint]
 ) -> Sequence[NetworkFlowEndpoint]:
+    multicast = is_multicast(end.internet_address)
     fitting = [
         each
         for each in senders
         if each.transport_protocol is end.transport_protocol
         and each.internet_protocol is end.internet_protocol
-        and _may_reach(each.internet_address, end.internet_address)
+        and (
+            multicast
+            or is_wildcard(each.internet_address)
+            or is_loopback(each.internet_address) == is_loopback(end.internet_address)
+        )
     ]
-    multicast = is_multicast(end.internet_address)
     own_kind = [each for each in fitting if is_wildcard(each.internet_address) is not multicast]
     return own_kind or fitting
-
-
-def _may_reach(source: str, destination: str) -> bool:
-    if is_wildcard(source) or is_multicast(destination):
-        return True
-    return is_loopback(source) == is_loopback(destination)

@@ -153,11 +153,8 @@ class CamaraTarget(ServerTarget):
         return None if due_s == math.inf else due_s
 
     def _prolong(self, entry: Entry) -> None:
-        made = self._prolonged(entry, json.loads(entry.body))
-        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
-
-    def _prolonged(self, entry: Entry, body: Body) -> Made:
         """Extend a session; make a new one where it cannot be extended any further."""
+        body, made = json.loads(entry.body), None
         try:
             reply = self._api.request(
                 "POST",
@@ -172,9 +169,9 @@ class CamaraTarget(ServerTarget):
         else:
             if not is_gone(reply):
                 made = self._made(read_answer(reply, _Session), body)
-                if made.expires_s is not None and made.expires_s > (entry.expires_s or 0.0) + 1:
-                    return made
-        return self.update(entry.id, body, body)
+        if made is None or (made.expires_s or 0.0) <= (entry.expires_s or 0.0) + 1:
+            made = self.update(entry.id, body, body)
+        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
 
     def _due_in_s(self, entry: Entry) -> float:
         """Return seconds until a session must be prolonged; negative once it is late."""

@@ -185,17 +185,14 @@ def flow_match(rule: FlowRule) -> str:
 
 
 def chain_line(match: str, statement: str, comment: str) -> str:
-    """Return one line of a chain, which counts the packets that it matches."""
-    return f'{match} {statement} counter comment "{_fitting(comment)}"'
+    """Return one line of a chain, which counts the packets that it matches.
 
-
-def _fitting(comment: str) -> str:
-    """Text that fits between quotes and into a comment; what is cut off ends with dots."""
+    Of a comment that is too long the end is cut off, which dots say.
+    """
     plain = " ".join(comment.replace('"', "'").split())
-    encoded = plain.encode()
-    if len(encoded) <= MAX_COMMENT_BYTES:
-        return plain
-    return encoded[: MAX_COMMENT_BYTES - 3].decode(errors="ignore") + "..."
+    if len(encoded := plain.encode()) > MAX_COMMENT_BYTES:
+        plain = encoded[: MAX_COMMENT_BYTES - 3].decode(errors="ignore") + "..."
+    return f'{match} {statement} counter comment "{plain}"'
 
 
 def render_table(table: str, lines: Iterable[str], *, priority: str = "mangle") -> str:

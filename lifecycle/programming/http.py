@@ -8,11 +8,9 @@ names the request and the field.
 from __future__ import annotations
 
 import email.utils
-import errno
 import ipaddress
 import os
 import re
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +18,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 import msgspec
 import yaml
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
@@ -31,6 +30,7 @@ from lifecycle.programming.target import (
     SettingsError,
     target_kind,
 )
+from lifecycle.run_directory import read_regular
 
 try:
     import httpx
@@ -41,19 +41,6 @@ _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
 
 IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
-
-
-def read_file(path: str | Path, most: int) -> bytes:
-    """Return the first `most` bytes of a regular file, without ever waiting for a writer.
-
-    Raises:
-        OSError: it cannot be read, or is a pipe, a device or anything else that is no file.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file")
-        return file.read(most)
 
 
 class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -83,7 +70,7 @@ class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         else:
             where = f"file {self.file!r}"
             try:
-                text = read_file(self.file, _MAX_TOKEN_BYTES).decode("ascii")
+                text = read_regular(self.file, _MAX_TOKEN_BYTES).decode("ascii")
             except (OSError, UnicodeDecodeError) as error:
                 reason = error.strerror if isinstance(error, OSError) else "it is not ASCII text"
                 # The cause is left out on purpose: a decoding error quotes the bytes.
@@ -115,7 +102,15 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     timeout_s: float = 10.0
 
     def __post_init__(self) -> None:
-        self._check_url()
+        url, parts = self.url, urlsplit(self.url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
+        if parts.username or parts.password:
+            raise ValueError("cannot use a url with a password in it; use token")
+        if parts.query or parts.fragment:
+            raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
+        if self.token is not None and parts.scheme == "http" and not self.is_local:
+            raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
         if not 0 < self.timeout_s < float("inf"):
             raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
         if not self.networks:
@@ -149,18 +144,6 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         """What the server is told apart from others by, and where it is asked: a URL."""
         return self.url.rstrip("/")
 
-    def _check_url(self) -> None:
-        """A URL that a token may be sent to: https, or this host."""
-        url, parts = self.url, urlsplit(self.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError(f"cannot use url {url!r}; use http:// or https:// and a host")
-        if parts.username or parts.password:
-            raise ValueError("cannot use a url with a password in it; use token")
-        if parts.query or parts.fragment:
-            raise ValueError(f"cannot use url {url!r}; leave out what follows '?' or '#'")
-        if self.token is not None and parts.scheme == "http" and not self.is_local:
-            raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
-
 
 def load_settings(path: str | Path) -> dict[str, ServerSettings]:
     """Read a settings file, YAML or JSON.
@@ -176,7 +159,7 @@ def load_settings(path: str | Path) -> dict[str, ServerSettings]:
     keys = [(name, type_ | None, None) for name, type_ in types.items() if type_ is not None]
     file_type = msgspec.defstruct("Settings", keys, frozen=True, forbid_unknown_fields=True)
     try:
-        data = read_file(file, _MAX_BYTES + 1)
+        data = read_regular(file, _MAX_BYTES + 1)
     except OSError as error:
         raise SettingsError(f"cannot read settings {str(path)!r}: {error.strerror}") from error
     if len(data) > _MAX_BYTES:
@@ -198,17 +181,12 @@ def load_settings(path: str | Path) -> dict[str, ServerSettings]:
             f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
             "that is none"
         ) from None
-    servers = {name: getattr(found, name) for name, *_ in keys}
-    folder = file.absolute().parent
-    return {name: _beside(each, folder) for name, each in servers.items() if each is not None}
-
-
-def _beside(settings: ServerSettings, folder: Path) -> ServerSettings:
-    """Make the file of a token one beside the settings file."""
-    if settings.token is None or not settings.token.file:
-        return settings
-    token = Token(file=str(folder / settings.token.file))
-    return msgspec.structs.replace(settings, token=token)
+    servers = {name: each for name in types if (each := getattr(found, name, None)) is not None}
+    for name, each in servers.items():
+        if each.token is not None and each.token.file:
+            token = Token(file=str(file.absolute().parent / each.token.file))
+            servers[name] = replace(each, token=token)
+    return servers
 
 
 def readable(error: Exception) -> str:
@@ -375,9 +353,8 @@ class Api:
             "accept": "application/json, application/problem+json",
             # A few bytes packed well may be as many gigabytes unpacked.
             "accept-encoding": "identity",
+            **({} if body is None else {"content-type": "application/json"}),
         }
-        if body is not None:
-            headers["content-type"] = "application/json"
         content = None if body is None else to_json(body)
         request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
         wait_s, attempt = self.patience.first_s, 1

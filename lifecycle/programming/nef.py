@@ -8,22 +8,13 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import re
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec import to_builtins
 from msgspec.structs import replace
 
-from lifecycle.programming.http import (
-    ServerSettings,
-    as_segment,
-    is_gone,
-    linked,
-    read_answer,
-    text_of,
-    unusable,
-)
+from lifecycle.programming import http
 from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
 from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 
@@ -38,7 +29,7 @@ _COMPARED = (*_FIXED, "qosReference", "notificationDestination", "flowInfo")
 _PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
 
 
-class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
 
     Attributes:
@@ -69,7 +60,9 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     @property
     def scope(self) -> str:
         """Our collection of subscriptions, without the last path segment."""
-        return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{as_segment(self.scs_as_id)}"
+        return (
+            f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{http.as_segment(self.scs_as_id)}"
+        )
 
 
 def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
@@ -140,20 +133,20 @@ class NefTarget(ServerTarget):
         shown = _shown(reply)
         made = reply.headers.get("location") or shown.link
         if not made:
-            raise unusable(reply, "it has neither a Location nor a self")
-        return Made(id=linked(reply, made), detail=_refused(shown))
+            raise http.unusable(reply, "it has neither a Location nor a self")
+        return Made(id=http.linked(reply, made), detail=_refused(shown))
 
     def look(self, id_: str, body: Body) -> Made | None:
         """GET it, or all of ours."""
         path = self.path(id_) if id_ else self.collection
         reply = self._api.request("GET", path, may_be_gone=True)
-        if is_gone(reply):
+        if http.is_gone(reply):
             return None
         if id_:
             return Made(id=id_, differs=_differs(body, _shown(reply)))
-        for each in read_answer(reply, tuple[_Subscription, ...]):
+        for each in http.read_answer(reply, tuple[_Subscription, ...]):
             if each.link and not _differs(body, each, missing=True):
-                return Made(id=linked(reply, each.link))
+                return Made(id=http.linked(reply, each.link))
         return None
 
     def update(self, id_: str, before: Body, body: Body) -> Made:
@@ -161,7 +154,7 @@ class NefTarget(ServerTarget):
         if any(before.get(key) != body.get(key) for key in _FIXED):
             return super().update(id_, before, body)
         reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
-        if is_gone(reply):
+        if http.is_gone(reply):
             return self.create(body)
         return Made(id=id_, detail=_refused(_shown(reply)))
 
@@ -172,27 +165,24 @@ def _shown(reply: httpx.Response) -> _Subscription:
     Raises:
         HttpError: a field is not what the interface has there.
     """
-    return read_answer(reply, _Subscription) if reply.content else _Subscription()
+    return http.read_answer(reply, _Subscription) if reply.content else _Subscription()
 
 
 def _refused(subscription: _Subscription) -> str:
     """Note it if the server granted another reference than was asked for."""
-    granted = text_of(subscription.applied_qos_ref)
+    granted = http.text_of(subscription.applied_qos_ref)
     return f"granted as {granted}" if granted else ""
 
 
 def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
-    wanted, shown = (
-        each
-        if each.flow_info is None
-        else replace(each, flow_info=_in_one_spelling(each.flow_info))
-        for each in (msgspec.convert(asked, _Subscription), seen)
-    )
-    return differs(to_builtins(wanted), shown, _COMPARED, missing=missing)
+    def in_one_spelling(each: _Subscription) -> _Subscription:
+        if each.flow_info is None:
+            return each
+        flows = (sorted(map(_spelled, flow.flow_descriptions)) for flow in each.flow_info)
+        return replace(each, flow_info=tuple(_Flow(tuple(filters)) for filters in flows))
 
-
-def _in_one_spelling(flows: Iterable[_Flow]) -> tuple[_Flow, ...]:
-    return tuple(_Flow(tuple(sorted(map(_spelled, each.flow_descriptions)))) for each in flows)
+    wanted = to_builtins(in_one_spelling(msgspec.convert(asked, _Subscription)))
+    return differs(wanted, in_one_spelling(seen), _COMPARED, missing=missing)
 
 
 TARGET = NefTarget

@@ -11,18 +11,7 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from lifecycle.network.dscp import describe
-from lifecycle.programming.host import (
-    HostTool,
-    Placed,
-    TableTarget,
-    Wanted,
-    chain_line,
-    flow_match,
-    network_of,
-    qdiscs,
-    render_table,
-    table_name,
-)
+from lifecycle.programming import host
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
@@ -33,13 +22,13 @@ _WITHOUT_PRIORITY = {"pfifo_fast": _BANDS, "prio": _BANDS, "pfifo": _BLIND, "fq_
 """What queueing disciplines do with marks; two sort by the old TOS bits."""
 
 
-class NftTarget(TableTarget):
+class NftTarget(host.TableTarget):
     """The table of one system."""
 
     kind = "nft"
 
-    def __init__(self, settings: None, means: Means, tool: HostTool | None = None) -> None:
-        table = table_name(means.ledger.system)
+    def __init__(self, settings: None, means: Means, tool: host.HostTool | None = None) -> None:
+        table = host.table_name(means.ledger.system)
         super().__init__(settings, means, tool, table=table, scope=table)
         self.name = f"nft table inet {table}"
 
@@ -50,7 +39,7 @@ class NftTarget(TableTarget):
     def lines(self, rule: FlowRule) -> Sequence[str]:
         """Return what sets its DSCP and its flow label."""
         found = []
-        network = network_of(rule)
+        network = host.network_of(rule)
         if rule.dscp is not None:
             found.append((f"{network} dscp set {rule.dscp}", describe(rule.dscp)))
         if rule.flow_label:
@@ -58,14 +47,16 @@ class NftTarget(TableTarget):
             found.append((f"{network} flowlabel set {label}", f"flow label {label}"))
         if not found:
             raise ValueError("it has no DSCP and no flow label to set")
-        match, flows = flow_match(rule), rule.named
-        return [chain_line(match, statement, f"{mark}: {flows}") for statement, mark in found]
+        match, flows = host.flow_match(rule), rule.named
+        return [host.chain_line(match, statement, f"{mark}: {flows}") for statement, mark in found]
 
-    def wanted(self, placed: Placed) -> Wanted:
+    def wanted(self, placed: host.Placed) -> host.Wanted:
         """Return the table."""
-        return Wanted(render_table(self._table, (each for _, of in placed for each in of)))
+        return host.Wanted(
+            host.render_table(self._table, (each for _, of in placed for each in of))
+        )
 
-    def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
+    def script(self, wanted: host.Wanted, remarks: Sequence[str]) -> str:
         """Return a ruleset for `nft -f` that replaces the system's table in one transaction."""
         lines = [
             f"# Marks the verified flows of system {self._ledger.system}. Check without privilege:",
@@ -83,7 +74,7 @@ class NftTarget(TableTarget):
 
     def _warnings(self) -> tuple[str, ...]:
         try:
-            found = qdiscs(self._tool, doing="list queueing disciplines")
+            found = host.qdiscs(self._tool, doing="list queueing disciplines")
         except ProgrammingError:
             return ()
         return tuple(

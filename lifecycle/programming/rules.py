@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.network.dscp import describe, parse_dscp
+from lifecycle.network.dscp import describe
 from lifecycle.network.five_qi import DscpMapping
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import (
@@ -45,9 +45,8 @@ MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""
 
 _UNSEEN = {
-    each.value: f"{each.stays_in}: no packet that a network could see"
-    for each in Medium
-    if each.stays_in
+    str(medium): f"{where}: no packet that a network could see"
+    for medium, where in ((Medium.SHM, "shared memory"), (Medium.INTRAPROCESS, "one process"))
 }
 """Why no network sees a flow, by its effective transport."""
 
@@ -89,10 +88,6 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
     max_delay_ms: float | None = None
 
     def __post_init__(self) -> None:
-        if self.transport_protocol.value not in PROTOCOL_NUMBERS:
-            raise ValueError(
-                f"cannot match protocol {self.transport_protocol.value!r}; use udp or tcp"
-            )
         for port in (self.source_port, self.destination_port):
             if not 1 <= port <= 65535:
                 raise ValueError(f"cannot use port {port}; use 1 to 65535")
@@ -101,12 +96,6 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(
                 f"cannot filter packets from {self.source_address} to {self.destination_address}: "
                 f"one is IPv{of}, the other IPv{to}; use two addresses of one family"
-            )
-        if self.dscp is not None:
-            parse_dscp(self.dscp)
-        if not 0 <= self.flow_label <= MAX_FLOW_LABEL:
-            raise ValueError(
-                f"cannot use flow label {self.flow_label:#x}; use 0 to {MAX_FLOW_LABEL:#x}"
             )
         if self.flow_label and self.internet_protocol is InternetProtocol.IPV4:
             raise ValueError(
@@ -253,7 +242,10 @@ def _rules_of(
         leave_out("its two ends have no IP transport in common")
     publisher = _node(plan, report.publisher)
     subscription = _node(plan, report.subscription)
-    remote = publisher is None or subscription is None or not _same_host(plan, report)
+    # One host may be one machine, or machines of one address.
+    addresses = {each.name: each.address for each in plan.machines}
+    ends = [addresses.get(each.machine, "") for each in (publisher, subscription) if each]
+    remote = len(ends) < 2 or ends[0] != ends[1]
     dscp, five_qi = _ask(report, publisher, subscription)
     for each in report.tuples:
         # A zone (`fe80::1%eth0`) names an interface of its own host and is not in the packet.
@@ -386,14 +378,6 @@ def _endpoint(node: PlannedNode | None, kind: EndpointKind, topic: str) -> Plann
         each for each in found if (publishes and each.dscp is not None) or each.five_qi is not None
     ]
     return next(iter((*asking, *found)), None)
-
-
-def _same_host(plan: Plan, report: FlowReport) -> bool:
-    """Whether both ends may be on one host: one machine, or machines of one address."""
-    addresses = {each.name: each.address for each in plan.machines}
-    ends = [_node(plan, name) for name in (report.publisher, report.subscription)]
-    places = {"" if end is None else addresses.get(end.machine, "") for end in ends}
-    return len(places) == 1
 
 
 def expressed(

@@ -154,9 +154,13 @@ class ServerTarget(Target):
 
     def __init__(self, settings: str, means: Means) -> None:
         super().__init__(settings, means)
-        self._server: Any = self._of_file(settings)
-        self._api = Api(self._server, means)
         path = str(Path(settings).absolute())
+        self._server: Any = load_settings(settings).get(self.kind)
+        if self._server is None:
+            raise SettingsError(
+                f"cannot program {self.kind}: settings {path!r} have no key {self.kind!r}"
+            )
+        self._api = Api(self._server, means)
         self._record = TargetRecord(target=self.kind, scope=self._api.url, settings=path)
         self.name = f"{self.kind} at {self._api.url}"
 
@@ -187,16 +191,6 @@ class ServerTarget(Target):
         """Return those of every server of the file."""
         servers = load_settings(settings).values()
         return frozenset(each.token.env for each in servers if each.token and each.token.env)
-
-    @classmethod
-    def _of_file(cls, path: str) -> ServerSettings:
-        own = load_settings(path).get(cls.kind)
-        if own is None:
-            raise SettingsError(
-                f"cannot program {cls.kind}: settings {str(Path(path).absolute())!r} have no key "
-                f"{cls.kind!r}"
-            )
-        return own
 
     def export(self, rules: RuleSet) -> str:
         """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""

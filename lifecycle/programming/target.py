@@ -38,12 +38,7 @@ class ChangeKind(enum.Enum):
     KEEP = "keep"
 
 
-_SIGNS = {
-    ChangeKind.CREATE: "+",
-    ChangeKind.UPDATE: "~",
-    ChangeKind.DELETE: "-",
-    ChangeKind.KEEP: "=",
-}
+_SIGNS = dict(zip(ChangeKind, "+~-=", strict=True))
 
 
 class FlowChange(msgspec.Struct, frozen=True, kw_only=True):

@@ -28,19 +28,7 @@ import msgspec
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
-from lifecycle.programming.host import (
-    HostTool,
-    Placed,
-    Qdisc,
-    TableTarget,
-    Wanted,
-    chain_line,
-    demand,
-    flow_match,
-    qdiscs,
-    render_table,
-    table_name,
-)
+from lifecycle.programming import host
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.target import Means, ProgrammingError
@@ -257,11 +245,6 @@ def divide(
     return found
 
 
-def _table_name(system: str, device: str) -> str:
-    """The name of a device's table, `flowtc_eth0_teleop`."""
-    return table_name(system, f"flowtc_{re.sub(r'[^A-Za-z0-9_.-]', '_', device)}")
-
-
 def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]:
     device, link_kbit, major = settings.device, settings.link_kbit, OWNED_HANDLE
     rates = divide(classes, link_kbit=link_kbit, guaranteed_kbit=settings.guaranteed_kbit)
@@ -283,16 +266,19 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
         )
 
 
-class TcTarget(TableTarget):
+class TcTarget(host.TableTarget):
     """One device."""
 
     kind = "tc"
     hint = "give --device eth0 --rate 20mbit"
     gone = "the qdisc was gone"
 
-    def __init__(self, settings: TcSettings, means: Means, tool: HostTool | None = None) -> None:
+    def __init__(
+        self, settings: TcSettings, means: Means, tool: host.HostTool | None = None
+    ) -> None:
         self._device = settings.device
-        table = _table_name(means.ledger.system, self._device)
+        device = re.sub(r"[^A-Za-z0-9_.-]", "_", self._device)
+        table = host.table_name(means.ledger.system, f"flowtc_{device}")
         super().__init__(settings, means, tool, table=table, scope=self._device)
         self.name = f"tc on {self._device}"
 
@@ -334,7 +320,7 @@ class TcTarget(TableTarget):
             raise ValueError(
                 "it has no DSCP but DF and no 5QI to queue it by, and stays with the rest"
             )
-        matches, comment = [flow_match(rule)], f"{class_.comment}: {rule.named}"
+        matches, comment = [host.flow_match(rule)], f"{class_.comment}: {rule.named}"
         if self._settings.match is TcMatch.MARK:
             if rule.dscp is None:
                 raise ValueError("it has no DSCP, and rules look at nothing else here")
@@ -342,11 +328,11 @@ class TcTarget(TableTarget):
             comment = class_.comment
         statement = f"meta priority set {OWNED_HANDLE}{class_.minor:x}"
         out = f'oifname "{self._device}"'
-        return [chain_line(f"{out} {match}", statement, comment) for match in matches]
+        return [host.chain_line(f"{out} {match}", statement, comment) for match in matches]
 
-    def wanted(self, placed: Placed) -> Wanted:
+    def wanted(self, placed: host.Placed) -> host.Wanted:
         """Return lines for `tc -batch`, and the table."""
-        table = render_table(
+        table = host.render_table(
             self._table,
             (each for _, lines in placed for each in lines),
             priority="-149",  # after the marks of the system's own table, which are set at `mangle`
@@ -354,9 +340,9 @@ class TcTarget(TableTarget):
         root = f"dev {self._device} root handle {OWNED_HANDLE}"
         classes = _htb(classes_of(rule for rule, _ in placed), self._settings)
         qdisc = f"qdisc add {root} htb default {DEFAULT_MINOR:#x}"
-        return Wanted(table, beside="\n".join((qdisc, *classes, "")))
+        return host.Wanted(table, beside="\n".join((qdisc, *classes, "")))
 
-    def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
+    def script(self, wanted: host.Wanted, remarks: Sequence[str]) -> str:
         """Return a file for `sh FILE` that gives `tc -batch` and `nft -f` their lines."""
         system = self._ledger.system
         lines = [
@@ -375,7 +361,7 @@ class TcTarget(TableTarget):
         """Return the table, where the device has our qdisc."""
         return f"{OWNED_HANDLE}\n{self.listing()}" if self._own_root() else ""
 
-    def write(self, wanted: Wanted, *, anew: bool) -> None:
+    def write(self, wanted: host.Wanted, *, anew: bool) -> None:
         """Write the table, and before it the qdisc and its classes anew."""
         if anew:
             if self._is_ours():
@@ -390,15 +376,15 @@ class TcTarget(TableTarget):
             self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
         return super().clear() or ours
 
-    def _root(self) -> Qdisc | None:
+    def _root(self) -> host.Qdisc | None:
         """The device's root qdisc; None if there is no such device."""
         try:
-            listed = qdiscs(self._tool, "dev", self._device, doing=f"read {self.name}")
+            listed = host.qdiscs(self._tool, "dev", self._device, doing=f"read {self.name}")
         except ProgrammingError as error:
             if _NO_DEVICE.search(error.message):
                 return None
             raise
-        return next((each for each in listed if each.root), Qdisc(kind="noqueue"))
+        return next((each for each in listed if each.root), host.Qdisc(kind="noqueue"))
 
     def _is_ours(self) -> bool:
         root = self._root()
@@ -429,7 +415,7 @@ class TcTarget(TableTarget):
         return True
 
     def _batch(self, lines: str) -> None:
-        demand(self._tool, ("tc", "-batch", "-"), doing=f"program {self.name}", stdin=lines)
+        host.demand(self._tool, ("tc", "-batch", "-"), doing=f"program {self.name}", stdin=lines)
 
 
 def _guarantee(text: str) -> tuple[str, int]:

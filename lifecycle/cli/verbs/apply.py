@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import click
 from msgspec.structs import asdict
 
-from lifecycle.cli.common import (
-    assignments_argument,
-    completing,
-    format_option,
-    json_of,
-    load_plan,
-    machine_option,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.codec import Count, says
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import lines
@@ -60,14 +52,14 @@ class ApplyReport(ChangedNodes, frozen=True, kw_only=True):
 
 
 @click.command("apply")
-@click.argument("manifest", metavar="MANIFEST", shell_complete=completing("manifests"))
-@assignments_argument
-@machine_option("As it was given to `lifecycle up`.")
+@click.argument("manifest", metavar="MANIFEST", shell_complete=common.completing("manifests"))
+@common.assignments_argument
+@common.machine_option("As it was given to `lifecycle up`.")
 @click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
-@timeout_option(
+@common.timeout_option(
     60.0, "Until the system must be active by it; else it goes back to the manifest before."
 )
-@format_option("text", "json")
+@common.format_option("text", "json")
 def command(
     *,
     manifest: str,
@@ -86,7 +78,7 @@ def command(
     4 or 5 for a verdict, with 6 for a step. Exits with 2 where a running supervisor cannot take
     it, and with 0 once the system is active and verified by it.
     """
-    plan = load_plan(manifest, assignments, machine=machine)
+    plan = common.load_plan(manifest, assignments, machine=machine)
     path = _run_of(plan, machine)
     as_text = format_ == "text"
     answer = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
@@ -97,7 +89,15 @@ def command(
         outcome = "unchanged"
     else:
         if as_text:
-            click.echo(lines("\n".join(_changed(change))))
+            what = {
+                "added": change.added,
+                "removed": change.removed,
+                "restarted": change.restarted,
+                "given parameters": change.parameters,
+            }
+            done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
+            done = done or ["no node is touched: what runs is judged by the new rules"]
+            click.echo(lines("\n".join((*change.differences, *done))))
         outcome = "would_apply"
     if outcome == "would_apply" and not dry_run:
         wait_s = 2 * timeout + _SPARE_S
@@ -114,10 +114,16 @@ def command(
         error=answer.error,
         **asdict(change or ChangedNodes(revision=0)),
     )
-    if as_text:
-        _say(report)
-    else:
-        click.echo(json_of(report))
+    if not as_text:
+        click.echo(common.json_of(report))
+    elif report.error:
+        common.say(report.error)
+    elif outcome == "unchanged":
+        click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
+    elif outcome == "applied":
+        click.echo(
+            f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
+        )
     return report.exit_code
 
 
@@ -169,29 +175,3 @@ def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: f
             "at it",
             hint=f"see what it does: lifecycle status {path.name}",
         ) from error
-
-
-def _say(report: ApplyReport) -> None:
-    if report.error:
-        click.echo(lines(report.error), err=True)
-    elif report.outcome == "unchanged":
-        click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
-    elif report.outcome == "applied":
-        click.echo(
-            f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
-        )
-
-
-def _changed(change: ChangedNodes) -> list[str]:
-    """Return how the manifests differ, and what becomes of which node."""
-    what = {
-        "added": change.added,
-        "removed": change.removed,
-        "restarted": change.restarted,
-        "given parameters": change.parameters,
-    }
-    done = [f"{word}: {', '.join(names)}" for word, names in what.items() if names]
-    return [
-        *change.differences,
-        *(done or ["no node is touched: what runs is judged by the new rules"]),
-    ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import output_option, write_text
+from lifecycle.cli.common import output_option, say, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import one_line
 
@@ -88,13 +88,12 @@ def command(
     )
     if not captured.nodes:
         below = f" in or below {', '.join(namespaces)}" if namespaces else ""
-        click.echo(
+        say(
             f"no node{below}; looked in ROS domain {captured.domain_id}, discovery range "
             f"{captured.discovery_range.value}\n"
             "nodes that only listed peers, a discovery server or shared memory lead to are not "
             "found so: `discovery: mode:` of their manifest says which; it is what to verify them "
-            "by",
-            err=True,
+            "by"
         )
         _say_gaps(captured)
         return ExitCode.VIOLATED
@@ -111,7 +110,7 @@ def command(
 
 def _say_gaps(captured: CapturedSystem) -> None:
     for gap in captured.gaps:
-        click.echo(one_line(f"gap: {gap}"), err=True)
+        say(one_line(f"gap: {gap}"))
 
 
 def _check_name(system: str) -> None:

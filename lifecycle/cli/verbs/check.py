@@ -14,20 +14,8 @@ import click
 import msgspec
 
 from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
-from lifecycle.cli.common import (
-    format_option,
-    json_of,
-    machine_option,
-    manifest_arguments,
-    parse_assignments,
-    resolve,
-    run_commands_option,
-)
-from lifecycle.cli.report import (
-    report_format,
-    report_option,
-    write_report,
-)
+from lifecycle.cli import common
+from lifecycle.cli.report import report_format, report_option, write_report
 from lifecycle.codec import Count
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
@@ -81,7 +69,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     What is unproven or could not be resolved is a failure if it is `strict`.
     """
     if format_ == "json":
-        return json_of(report)
+        return common.json_of(report)
     if format_ == "sarif":
         return _sarif(report).rstrip("\n")
     if format_ == "junit":
@@ -125,9 +113,12 @@ def _problem(found: Diagnostic, *, fails: bool = False) -> Problem:
 
 
 def _junit(report: CheckReport, *, strict: bool) -> str:
+    of_test: dict[str, list[Diagnostic]] = {name: [] for name in TESTS}
+    for each in report.diagnostics:
+        covers = (name for name, begin in TESTS.items() if each.rule.startswith(begin))
+        of_test[next(covers, "system")].append(each)
     cases = []
-    for name in TESTS:
-        found = [each for each in report.diagnostics if _test(each.rule) == name]
+    for name, found in of_test.items():
         bad = [
             str(each)
             for each in found
@@ -145,10 +136,6 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
             )
         )
     return junit([Suite(name=f"lifecycle check {report.manifest}", cases=cases)])
-
-
-def _test(rule: str) -> str:
-    return next((name for name, begin in TESTS.items() if rule.startswith(begin)), "system")
 
 
 def _sarif(report: CheckReport) -> str:
@@ -175,18 +162,18 @@ _UNRESOLVED = "program.unresolved"
 
 
 @click.command()
-@manifest_arguments
-@format_option("text", "json", "sarif", "junit", "github")
+@common.manifest_arguments
+@common.format_option("text", "json", "sarif", "junit", "github")
 @click.option(
     "--strict",
     is_flag=True,
     help="Let what is not proven (warnings, what could not be resolved) fail it, too.",
 )
-@machine_option("The machine that this host is; default: all whose address is this host's.")
+@common.machine_option("The machine that this host is; default: all whose address is this host's.")
 @click.option(
     "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
 )
-@run_commands_option
+@common.run_commands_option
 @report_option
 def command(
     *,
@@ -232,7 +219,7 @@ def _list(path: str, format_: str, *, others: bool) -> int:
         )
     found = declared_arguments(path)
     if format_ == "json":
-        click.echo(json_of(found))
+        click.echo(common.json_of(found))
     else:
         text = "\n".join(map(_argument, found)) or f"{path} takes no arguments"
         click.echo(lines(text))
@@ -278,9 +265,9 @@ def check(
     loaded: Manifest | None = None
     resolution = Resolution()
     try:
-        result = load(path, parse_assignments(assignments), run_commands=run_commands)
+        result = load(path, common.parse_assignments(assignments), run_commands=run_commands)
         effective_domain(result.manifest.discovery, os.environ)
-        resolution = resolve(result.manifest, machine)
+        resolution = common.resolve(result.manifest, machine)
         diagnostics = (
             *result.warnings,
             *check_plan(result.manifest, files=result.files),

@@ -9,24 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import (
-    asking,
-    assignments_argument,
-    completing,
-    format_option,
-    json_of,
-    machine_option,
-    target_argument,
-    target_arguments,
-    target_plan,
-    target_run,
-    terminal_width,
-    timeout_option,
-    wrapped,
-)
+from lifecycle.cli import common
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.measure.flows import measured_summary
-from lifecycle.printable import columns, count, lines, one_line
+from lifecycle.printable import columns, count, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,13 +43,14 @@ def status_text(
     above = [status_head(status), *([measured] if measured else [])]
     longest = max(_LEAST, width - _BESIDE) if height else 0
     heads, *rows = columns([_HEADS, *(_row(each, longest) for each in status.nodes)])
-    shown = [
-        [_coloured(line, node) if colour else line, *map(_connection, node.connections)]
-        for line, node in zip(rows, status.nodes, strict=True)
-    ]
+    shown = []
+    for line, node in zip(rows, status.nodes, strict=True):
+        style = _style(node) if colour else ""
+        coloured = f"{style}{line}{_PLAIN}" if style else line
+        shown.append([coloured, *map(_connection, node.connections)])
     if not height:
-        return wrapped([*above, heads, *(line for each in shown for line in each)], width)
-    above = [*wrapped(above, width).splitlines(), heads]
+        return common.wrapped([*above, heads, *(line for each in shown for line in each)], width)
+    above = [*common.wrapped(above, width).splitlines(), heads]
     return "\n".join([*above, *_that_fit(status, shown, height - len(above))])
 
 
@@ -105,11 +92,6 @@ def _style(node: NodeStatus) -> str:
     return _YELLOW if node.managed and node.state != "active" else ""
 
 
-def _coloured(line: str, node: NodeStatus) -> str:
-    style = _style(node)
-    return f"{style}{line}{_PLAIN}" if style else line
-
-
 def _connection(connection: ConnectionReport) -> str:
     """Return one connection in one line: what it is, what it is to and what it carries."""
     made = "established" if connection.established else "waits for peers"
@@ -124,21 +106,17 @@ def _row(node: NodeStatus, longest: int) -> tuple[str, ...]:
     if longest and len(name) > longest:
         name = f"…{name[1 - longest :]}"
     process = "not ours" if node.process_state is None else node.process_state.value
+    known = node.matched or node.unreported < node.endpoints or not node.endpoints
     cells = (
         name,
         process,
         str(node.pid or "–"),
         "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
-        _matched(node),
+        f"{node.matched if known else '–'}/{node.endpoints}",
         f"{node.unique_flows}/{node.flows}",
         node.died or (f"silent: {node.silent}" if node.silent else node.doing) or _history(node),
     )
     return tuple(map(one_line, cells))
-
-
-def _matched(node: NodeStatus) -> str:
-    known = node.matched or node.unreported < node.endpoints or not node.endpoints
-    return f"{node.matched if known else '–'}/{node.endpoints}"
 
 
 def _history(node: NodeStatus) -> str:
@@ -161,11 +139,11 @@ def _history(node: NodeStatus) -> str:
     "target",
     required=False,
     metavar="[TARGET]",
-    shell_complete=completing("manifests systems"),
+    shell_complete=common.completing("manifests systems"),
 )
-@assignments_argument
-@machine_option("As it was given to `lifecycle up`.")
-@format_option("text", "json")
+@common.assignments_argument
+@common.machine_option("As it was given to `lifecycle up`.")
+@common.format_option("text", "json")
 @click.option("--watch", is_flag=True, help="Show it again at every change; Ctrl-C ends.")
 @click.option(
     "--probe",
@@ -193,7 +171,7 @@ def status_command(
         if watch:
             raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
         return _list_running(format_)
-    path = target_run(os.environ, target, assignments, machine)
+    path = common.target_run(target, assignments, machine)
     if watch:
         return _watch(path, format_)
 
@@ -201,37 +179,36 @@ def status_command(
     from lifecycle.supervisor.control.protocol import status
     from lifecycle.verify.outcome import Outcome
 
-    with asking(path):
+    with common.asking(path):
         seen = status(path)
     if probe is not None:
         ready = seen.phase in ("measuring", "active") and seen.verdict is not Outcome.VIOLATED
         return ExitCode.OK if ready or probe == "live" else ExitCode.BRING_UP_FAILED
     if format_ == "json":
-        click.echo(json_of(seen))
+        click.echo(common.json_of(seen))
     else:
-        click.echo(status_text(seen, width=terminal_width()))
+        click.echo(status_text(seen, width=common.terminal_width()))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
 
 
 def _watch(path: Path, format_: str) -> int:
-    from lifecycle.cli.standard_streams import Watched
+    from lifecycle.cli.standard_streams import watched
     from lifecycle.supervisor.control.server import follow
     from lifecycle.verify.outcome import Outcome
 
     verdict, is_json = None, format_ == "json"
-    with Watched(whole=not is_json) as shown, asking(path):
+    with watched(whole=not is_json) as show, common.asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            shown.show(json_of(status) if is_json else _on_screen(status))
-    click.echo(f"{path.name}: its supervisor has ended", err=True)
+            if is_json:
+                show(common.json_of(status))
+            elif sys.stdout.isatty():
+                width, height = shutil.get_terminal_size()
+                show(status_text(status, width=width, height=height, colour=True))
+            else:
+                show(status_text(status))
+    common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
-
-
-def _on_screen(status: SystemStatus) -> str:
-    if not sys.stdout.isatty():
-        return status_text(status)
-    width, height = shutil.get_terminal_size()
-    return status_text(status, width=width, height=height, colour=True)
 
 
 def _list_running(format_: str) -> int:
@@ -240,11 +217,11 @@ def _list_running(format_: str) -> int:
     roots = run_roots(os.environ)
     names = [each.name for each in running(*roots)]
     if format_ == "json":
-        click.echo(json_of(names))
+        click.echo(common.json_of(names))
     else:
         click.echo("\n".join(names) or "no system runs")
         for each in left_behind(*roots):
-            click.echo(lines(str(lost(each))), err=True)
+            common.say(str(lost(each)))
     return ExitCode.OK
 
 
@@ -270,29 +247,29 @@ def _give_order(
     """
     plan = None
     if verb == "pause":  # which may be of a manifest that has changed
-        path = target_run(os.environ, target, assignments, machine)
+        path = common.target_run(target, assignments, machine)
     else:
-        path, plan = target_plan(os.environ, target, assignments, machine)
+        path, plan = common.target_plan(target, assignments, machine)
     from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
     try:
         answer = order(path, question, timeout)
     except TimeoutError:
-        click.echo(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it", err=True)
+        common.say(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it")
         return ExitCode.BRING_UP_FAILED
     if answer.error:
-        click.echo(lines(answer.error), err=True)
+        common.say(answer.error)
     assert answer.exit_code is not None
     return answer.exit_code
 
 
-_order_timeout = timeout_option(60.0, "How long to wait for it.")
+_order_timeout = common.timeout_option(60.0, "How long to wait for it.")
 
 
 @click.command("down")
-@target_arguments
-@timeout_option(60.0, "How long it may take.")
+@common.target_arguments
+@common.timeout_option(60.0, "How long it may take.")
 def down_command(
     *,
     target: str,
@@ -305,18 +282,18 @@ def down_command(
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
     supervisor itself was killed, what it left behind is ended too.
     """
-    path = target_run(os.environ, target, assignments, machine)
+    path = common.target_run(target, assignments, machine)
     from lifecycle.supervisor.control.protocol import down
 
     try:
         return down(path, timeout)
     except TimeoutError:
-        click.echo(f"cannot end {path.name!r} within {timeout:g} s; it still runs", err=True)
+        common.say(f"cannot end {path.name!r} within {timeout:g} s; it still runs")
         return ExitCode.BRING_UP_FAILED
 
 
 @click.command("pause")
-@target_arguments
+@common.target_arguments
 @_order_timeout
 def pause_command(target: str, assignments: tuple[str, ...], **options: Any) -> int:
     """Deactivate every managed node of a running system, in reverse order: data stops.
@@ -329,7 +306,7 @@ def pause_command(target: str, assignments: tuple[str, ...], **options: Any) -> 
 
 
 @click.command("resume")
-@target_arguments
+@common.target_arguments
 @_order_timeout
 def resume_command(target: str, assignments: tuple[str, ...], **options: Any) -> int:
     """Verify a paused system again, and activate it only if the gate opens.
@@ -342,14 +319,14 @@ def resume_command(target: str, assignments: tuple[str, ...], **options: Any) ->
 
 
 @click.command("restart")
-@target_argument
+@common.target_argument
 @click.argument(
     "words",
     nargs=-1,
     metavar="[NODE] [NAME:=VALUE]...",
-    shell_complete=completing("nodes arguments"),
+    shell_complete=common.completing("nodes arguments"),
 )
-@machine_option("As it was given to `lifecycle up`.")
+@common.machine_option("As it was given to `lifecycle up`.")
 @_order_timeout
 def restart_command(target: str, words: tuple[str, ...], **options: Any) -> int:
     """Take a running system down and bring it up again, or only the process of NODE.
@@ -368,14 +345,14 @@ def restart_command(target: str, words: tuple[str, ...], **options: Any) -> int:
 
 
 @click.command("mode")
-@target_argument
+@common.target_argument
 @click.argument(
     "words",
     nargs=-1,
     metavar="NAME [NAME:=VALUE]...",
-    shell_complete=completing("arguments"),
+    shell_complete=common.completing("arguments"),
 )
-@machine_option("As it was given to `lifecycle up`.")
+@common.machine_option("As it was given to `lifecycle up`.")
 @_order_timeout
 def mode_command(target: str, words: tuple[str, ...], **options: Any) -> int:
     """Enter a mode of a running system: another set of its nodes is active.

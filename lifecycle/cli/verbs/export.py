@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import F, load_plan, manifest_arguments, write_text
+from lifecycle.cli.common import F, load_plan, manifest_arguments, say, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.printable import lines
@@ -46,14 +46,18 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
 
     plan = load_plan(manifest, assignments)
     enclaves = enclaves_of(plan)
-    _check_paths(enclaves)
+    for each in enclaves:  # as the manifest spells it, and rcl would refuse it
+        if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", each.path):
+            raise UsageError(
+                f"cannot use enclave {each.path!r} of process {each.processes[0]!r}; "
+                "write an absolute name of letters, digits and '_', as in '/robot/camera'"
+            )
     write_text(output / "policy.xml", render_policy(enclaves))
     for node in plan.nodes:
         if node.endpoint_policy is EndpointPolicy.OPEN:
-            click.echo(
+            say(
                 f"{node.full_name} may make endpoints that are not declared (endpoints: open): "
-                "these are denied; declare those that it needs",
-                err=True,
+                "these are denied; declare those that it needs"
             )
     click.echo(lines(_next_commands(enclaves, output, plan.domain_id)))
     return ExitCode.OK
@@ -103,15 +107,23 @@ def _engine_command(engine: str) -> click.Command:
         from lifecycle.export.engines import ENGINES, Deployment
 
         words, timeout_s = _up_options(more, container=in_image)
-        _check_places(engine, at=at, **rest)
+        image, program = rest.get("image", ""), rest.get("program", "")
+        if in_image and (not image or re.search(r"\s", image) or image.startswith("-")):
+            raise UsageError(f"cannot use image {image!r}; write it as in 'registry/robot:1'")
+        for option, path in (("--program", program), ("--at", at)):
+            if not in_image and path and not path.startswith("/"):
+                raise UsageError(
+                    f"cannot use {option} {path!r} in a unit: a service has no working directory "
+                    "of ours; write an absolute path"
+                )
         here = str(Path(manifest).resolve())
         inside = f"/system/{Path(manifest).name}" if in_image else here
         deployment = Deployment(
             plan=load_plan(manifest, assignments),
             manifest=at or inside,
             words=(*assignments, *words),
-            image=rest.get("image", ""),
-            program=rest.get("program", ""),
+            image=image,
+            program=program,
             timeout_s=timeout_s,
             programs_networks=any(each.startswith("--program") for each in words),
         )
@@ -161,14 +173,11 @@ def _say_secret(word: str, engine: str) -> None:
     if not value or shown(name, value) == value:
         return
     variable = name.upper().replace("-", "_")
-    click.echo(
-        lines(
-            f"warning: the value of {name!r} is in what was written as it was given, and will be "
-            "in a command line, which every user of the machine can read; have the manifest take "
-            f"it from the environment, 'default: $(env {variable} \"\")', leave it out here, and "
-            f"give it by {_VARIABLES[engine]}"
-        ),
-        err=True,
+    say(
+        f"warning: the value of {name!r} is in what was written as it was given, and will be "
+        "in a command line, which every user of the machine can read; have the manifest take "
+        f"it from the environment, 'default: $(env {variable} \"\")', leave it out here, and "
+        f"give it by {_VARIABLES[engine]}"
     )
 
 
@@ -210,29 +219,6 @@ def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:
             hint="program them on the machine: lifecycle export systemd … --up '--program …'",
         )
     return words, given["timeout"] or 0.0
-
-
-def _check_places(engine: str, *, at: str, program: str = "", image: str = "") -> None:
-    """Raise UsageError for a path or an image that the engine would refuse, or not find."""
-    if engine == "systemd":
-        for option, path in (("--program", program), ("--at", at)):
-            if path and not path.startswith("/"):
-                raise UsageError(
-                    f"cannot use {option} {path!r} in a unit: a service has no working directory "
-                    "of ours; write an absolute path"
-                )
-    elif not image or re.search(r"\s", image) or image.startswith("-"):
-        raise UsageError(f"cannot use image {image!r}; write it as in 'registry/robot:1'")
-
-
-def _check_paths(enclaves: tuple[Enclave, ...]) -> None:
-    """Raise UsageError for an enclave's path that the manifest spells and rcl would refuse."""
-    for each in enclaves:
-        if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", each.path):
-            raise UsageError(
-                f"cannot use enclave {each.path!r} of process {each.processes[0]!r}; "
-                "write an absolute name of letters, digits and '_', as in '/robot/camera'"
-            )
 
 
 def _next_commands(enclaves: tuple[Enclave, ...], output: Path, domain_id: int) -> str:

@@ -14,23 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import (
-    asking,
-    assignments_argument,
-    export_option,
-    format_option,
-    is_manifest,
-    load_plan,
-    manifest_arguments,
-    network_options,
-    read_networks,
-    target_argument,
-    target_plan,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.cli.flow_tables import Record, render_flows, watched_flows
 from lifecycle.cli.report import exit_code
-from lifecycle.cli.standard_streams import Watched
+from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
@@ -38,11 +25,10 @@ from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
-    from lifecycle.measure.flows import FlowMeasurement
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
     from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen, TargetChanges
+    from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.run.looking import JudgedSystem
 
 
@@ -67,7 +53,7 @@ _EMPTY_GRAPH_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
-_timeout = timeout_option(5.0, "How long flows that are not complete may still become so.")
+_timeout = common.timeout_option(5.0, "How long flows that are not complete may still become so.")
 
 
 class _ShowsByDefault(click.Group):
@@ -102,9 +88,9 @@ def command() -> None:
 
 
 @command.command("show", hidden=True)
-@target_argument
-@assignments_argument
-@format_option("text", "json", "csv")
+@common.target_argument
+@common.assignments_argument
+@common.format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @click.option(
     "--record",
@@ -121,7 +107,12 @@ def command() -> None:
 )
 @click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
-@export_option
+@common.network_options(
+    "--export",
+    "export_",
+    help_="Print the verified flows as rules, settings or request bodies of another system "
+    "instead.",
+)
 def _show(
     *,
     target: str,
@@ -141,13 +132,11 @@ def _show(
         raise UsageError("cannot use --for or --force without --record FILE")
     if record is not None and (watch or export_ is not None):
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
-    exported = None
+    if watch and export_ is not None:
+        raise UsageError("cannot use --export with --watch; export once")
     if export_ is not None:
-        if watch:
-            raise UsageError("cannot use --export with --watch; export once")
         # What is exported for a network takes what programming it takes.
-        (network,), treatment = read_networks((export_,), rest, option="--export")
-        exported = (network, treatment)
+        (network,), treatment = common.read_networks((export_,), rest, option="--export")
     elif any(rest.values()):
         raise UsageError(
             "cannot say how to treat flows that are only shown",
@@ -166,9 +155,9 @@ def _show(
     seen = looking.judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
-        click.echo(lines(each), err=True)
-    if exported is not None:
-        export(seen.plan, seen.verdict.flows, *exported)
+        common.say(each)
+    if export_ is not None:
+        export(seen.plan, seen.verdict.flows, network, treatment)
     else:
         flows, measured = seen.verdict.flows, seen.verdict.measured
         click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
@@ -190,17 +179,17 @@ def _watch(plan: Plan, format_: str) -> int:
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
-    with Watched(whole=format_ == "text") as shown:
+    with watched(whole=format_ == "text") as show:
         if path is None:
             follow_running(
-                plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
+                plan, lambda seen: show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
             )
             return ExitCode.OK
-        with asking(path):
+        with common.asking(path):
             for seen in follow(path / "control"):
                 if seen.verdict is not None:
-                    shown.show(watched_flows(seen.verdict, format_))
-    click.echo(f"{path.name}: its supervisor has ended", err=True)
+                    show(watched_flows(seen.verdict, format_))
+    common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.OK
 
 
@@ -225,7 +214,7 @@ def _record(plan: Plan, record: Record, for_s: float | None) -> int:
                     for_s=for_s,
                 )
         finally:
-            click.echo(f"{count(record.rows, 'row')} in {str(record.path)!r}", err=True)
+            common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
     return ExitCode.OK
 
 
@@ -244,19 +233,19 @@ def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
         except UsageError:
             if number == 0:
                 raise
-            click.echo(f"{path.name}: its supervisor has ended", err=True)
+            common.say(f"{path.name}: its supervisor has ended")
             return
         record.add(measured)
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
-    if is_manifest(target) or target.endswith((".yaml", ".yml")):
-        return load_plan(target, assignments)
+    if common.is_manifest(target) or target.endswith((".yaml", ".yml")):
+        return common.load_plan(target, assignments)
     from lifecycle.supervisor.control.protocol import look
 
-    path, _ = target_plan(os.environ, target, assignments, "")
-    with asking(path):
+    path, _ = common.target_plan(target, assignments, "")
+    with common.asking(path):
         return look(path).plan
 
 
@@ -285,7 +274,8 @@ def apply(
             path = shlex.quote(plan.manifest_path)
             error.hint = f"take back what was done: lifecycle flows remove {path}"
         raise
-    _show_changes(changes, done=not dry_run)
+    for each in changes:
+        click.echo(each.render(done=not dry_run))
     _show_left_out(programmer.left_out)
     return any(each.pending for each in changes)
 
@@ -293,16 +283,21 @@ def apply(
 def remove(plan: Plan) -> int:
     """Remove everything of the system from every network that it was applied to."""
     changes = _open(plan, ()).close()
-    if changes:
-        _show_changes(changes, done=True)
-    else:
+    for each in changes:
+        click.echo(each.render(done=True))
+    if not changes:
         click.echo(f"nothing of system {plan.system} is in any network")
     return ExitCode.OK
 
 
 @command.command("apply")
-@manifest_arguments
-@network_options("--target", "Network to program; may be given several times.")
+@common.manifest_arguments
+@common.network_options(
+    "--target",
+    "targets",
+    help_="Network to program; may be given several times.",
+    multiple=True,
+)
 @click.option("--dry-run", is_flag=True, help="Say what would change; exits with 4 if anything.")
 @_timeout
 def _apply(
@@ -319,16 +314,16 @@ def _apply(
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    options, treatment = read_networks(targets, rest, option="--target")
+    options, treatment = common.read_networks(targets, rest, option="--target")
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
-    plan = load_plan(manifest, assignments)
+    plan = common.load_plan(manifest, assignments)
     seen = judge_running(plan, timeout_s=timeout, strict=False)
     seen = with_supervisors_numbers(seen)
     for each in seen.notices:
-        click.echo(lines(each), err=True)
+        common.say(each)
     flows = seen.verdict.flows
     changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
     if changed and dry_run:
@@ -337,7 +332,7 @@ def _apply(
         seen = _measured_again(seen)
     if code := exit_code(seen.verdict, strict=False):
         found = f"{seen.verdict.verdict.value}; {not_ok(seen.verdict)}"
-        click.echo(lines(f"the system is {found}"), err=True)
+        common.say(f"the system is {found}")
     return code
 
 
@@ -348,12 +343,9 @@ def _measured_again(seen: JudgedSystem) -> JudgedSystem:
         machine = {each.full_name: each.machine for each in seen.plan.nodes}
         there = sorted({machine[each.subscription] for each in seen.verdict.flows} - {""})
         on = f" on {' and '.join(there)}" if there else ""
-        click.echo(
-            lines(f"what arrives is measured{on}: see `lifecycle status {seen.plan.system}` there"),
-            err=True,
-        )
+        common.say(f"what arrives is measured{on}: see `lifecycle status {seen.plan.system}` there")
         return seen
-    click.echo(f"measuring for {_FRESH_S:g} s what has changed", err=True)
+    common.say(f"measuring for {_FRESH_S:g} s what has changed")
     from lifecycle.supervisor.run.looking import with_supervisors_numbers
 
     time.sleep(_FRESH_S)
@@ -362,7 +354,10 @@ def _measured_again(seen: JudgedSystem) -> JudgedSystem:
         if not any(each.violated for each in seen.verdict.measured):
             break
         time.sleep(1.0)
-    click.echo(before_and_after(before, seen.verdict.measured))
+    now = {each.pair: each.describe() for each in seen.verdict.measured}
+    for each in before:
+        click.echo(lines(f"before: {each.describe()}"))
+        click.echo(lines(f"after:  {now.get(each.pair, f'{each.name}: not measured')}"))
     return seen
 
 
@@ -373,22 +368,11 @@ _SETTLED_S = 4
 """Seconds more for numbers that are not kept: they may be of a queue that was full before."""
 
 
-def before_and_after(before: Iterable[FlowMeasurement], after: Iterable[FlowMeasurement]) -> str:
-    """Return what was measured of each flow before and after, a line for each."""
-    now = {each.pair: each for each in after}
-    said = []
-    for each in before:
-        then = now.get(each.pair)
-        said.append(f"before: {each.describe()}")
-        said.append(f"after:  {f'{each.name}: not measured' if then is None else then.describe()}")
-    return lines("\n".join(said))
-
-
 @command.command("remove")
-@manifest_arguments
+@common.manifest_arguments
 def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
-    return remove(load_plan(manifest, assignments))
+    return remove(common.load_plan(manifest, assignments))
 
 
 def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
@@ -397,12 +381,7 @@ def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = N
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 
 
-def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
-    for each in changes:
-        click.echo(each.render(done=done))
-
-
 def _show_left_out(flows: Iterable[str]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in flows:
-        click.echo(lines(f"left out: {each}"), err=True)
+        common.say(f"left out: {each}")

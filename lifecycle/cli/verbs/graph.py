@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import (
-    asking,
-    format_option,
-    is_manifest,
-    json_of,
-    load_plan,
-    output_option,
-    target_arguments,
-    target_run,
-    timeout_option,
-    write_text,
-)
-from lifecycle.cli.standard_streams import Watched
+from lifecycle.cli import common
+from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -29,11 +18,11 @@ if TYPE_CHECKING:
 
 
 @click.command("graph")
-@target_arguments
-@format_option("text", "mermaid", "svg", "html", "json")
-@output_option("picture")
+@common.target_arguments
+@common.format_option("text", "mermaid", "svg", "html", "json")
+@common.output_option("picture")
 @click.option("--watch", is_flag=True, help="Draw it again at every change; Ctrl-C ends.")
-@timeout_option(
+@common.timeout_option(
     2.0,
     "How long what is not as declared may still become so, where no supervisor is asked.",
     or_0=True,
@@ -59,21 +48,28 @@ def command(
         raise UsageError(
             f"cannot print one {format_} picture after another", hint="give --output FILE"
         )
-    path, plan = _found(target, assignments, machine)
+    from lifecycle.export.picture_writers import WRITERS
     from lifecycle.supervisor.control.protocol import look
     from lifecycle.supervisor.run import looking
 
-    with Watched(whole=watch and output is None and format_ == "text") as shown:
+    plan: Plan | None = None
+    if not common.is_manifest(target):
+        path: Path | None = common.target_run(target, assignments, machine)
+    else:
+        plan = common.load_plan(target, assignments, quiet=True)
+        path = looking.supervisor_of(os.environ, plan, machine)
+
+    with watched(whole=watch and output is None and format_ == "text") as show:
 
         def draw(picture: Picture) -> None:
-            text = render(picture, format_)
+            text = common.json_of(picture) if format_ == "json" else WRITERS[format_](picture)
             if output is not None:
-                write_text(output, text.rstrip("\n") + "\n")
+                common.write_text(output, text.rstrip("\n") + "\n")
             else:
-                shown.show(text)
+                show(text)
 
         if path is not None:
-            with asking(path):
+            with common.asking(path):
                 if not watch:
                     draw(looking.picture_of(look(path)))
                 else:
@@ -85,28 +81,7 @@ def command(
             judged = looking.judge_running(plan, timeout_s=timeout, strict=False)
             draw(judged.picture)
             if judged.where:
-                click.echo(judged.where, err=True)
+                common.say(judged.where)
     if path is not None and watch:
-        click.echo(f"{path.name}: its supervisor has ended", err=True)
+        common.say(f"{path.name}: its supervisor has ended")
     return ExitCode.OK
-
-
-def _found(
-    target: str, assignments: tuple[str, ...], machine: str
-) -> tuple[Path | None, Plan | None]:
-    """Return the run of a supervisor, or the plan to look for without one."""
-    if not is_manifest(target):
-        return target_run(os.environ, target, assignments, machine), None
-    from lifecycle.supervisor.run.looking import supervisor_of
-
-    plan = load_plan(target, assignments, quiet=True)
-    return supervisor_of(os.environ, plan, machine), plan
-
-
-def render(picture: Picture, format_: str) -> str:
-    """Return a picture in one of the formats of `--format`."""
-    if format_ == "json":
-        return json_of(picture)
-    from lifecycle.export.picture_writers import WRITERS
-
-    return WRITERS[format_](picture)

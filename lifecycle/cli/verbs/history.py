@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import completing, format_option
+from lifecycle.cli.common import completing, format_option, say
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import json_text, one_line
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.run.journal import RecordedRun
-    from lifecycle.verify.verdict import Finding, Verdict
+    from lifecycle.verify.verdict import Finding
 
 
 def _recorded(run: str | None, system: str) -> RecordedRun:
@@ -45,18 +45,10 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
             path = ros_log_root(os.environ) / run
     recorded = read_run(journal_files(path))
     for place, why in recorded.unreadable:
-        click.echo(lines(f"passed over {place}: {why}"), err=True)
+        say(f"passed over {place}: {why}")
     if recorded.run is None:
         raise UsageError(f"cannot read {str(path)!r} as a journal: no line says of which run")
     return recorded
-
-
-_SET_S = 0.5
-"""A clock that is ahead by so much more, or less, than at the line before was set meanwhile."""
-
-
-def _clock(at: float) -> str:
-    return dt.datetime.fromtimestamp(at).astimezone().strftime("%H:%M:%S.%f")[:-3]
 
 
 @click.command("history")
@@ -86,33 +78,22 @@ def _timeline(recorded: RecordedRun) -> Iterator[str]:
 
     over, narrator = False, Narrator()
     found: tuple[Finding, ...] = ()
-    ahead_s: float | None = None
     for each in recorded.moments:
         over = isinstance(each.event, Stopped) or (over and each.line.run is None)
-        at = f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}"
-        # The host's clock is ahead of the one that only goes forward: by as much, until it is set.
-        before_s, ahead_s = ahead_s, each.line.at - each.line.elapsed_s
-        set_s = 0.0 if before_s is None else ahead_s - before_s
-        if abs(set_s) >= _SET_S:
-            way = "forward" if set_s > 0 else "back"
-            yield f"{at}  the clock of this host was set {way} by {abs(set_s):.1f} s"
+        clock = dt.datetime.fromtimestamp(each.line.at).astimezone().strftime("%H:%M:%S.%f")[:-3]
+        at = f"{clock} {each.line.elapsed_s:+10.3f}"
         if each.event and (text := narrator.line(each.event)):
             yield f"{at}  {text}"
         if isinstance(each.event, VerdictChanged):
-            yield from _changes(found, each.event.verdict)
-            found = each.event.verdict.findings
+            before, found = found, each.event.verdict.findings
+            known = {(one.outcome, one.rule, one.subject) for one in before}
+            now = {(one.outcome, one.rule, one.subject) for one in found}
+            for one in found:
+                if (one.outcome, one.rule, one.subject) not in known:
+                    yield one_line(f"    + {one.outcome.value} {one.rule}: {one.message}")
+            for outcome, rule, subject in sorted(known - now, key=lambda gone: gone[1:]):
+                yield one_line(f"    - {outcome.value} {rule}: {subject}")
     if not over and recorded.moments:
         pid = recorded.run.supervisor if recorded.run else 0
         if not Path(f"/proc/{pid}").exists():
             yield f"the journal ends here: supervisor {pid} ended without saying so"
-
-
-def _changes(before: tuple[Finding, ...], verdict: Verdict) -> Iterator[str]:
-    """Say which findings came and which are gone."""
-    known = {(each.rule, each.subject, each.outcome) for each in before}
-    now = {(each.rule, each.subject, each.outcome) for each in verdict.findings}
-    for each in verdict.findings:
-        if (each.rule, each.subject, each.outcome) not in known:
-            yield one_line(f"    + {each.outcome.value} {each.rule}: {each.message}")
-    for rule, subject, outcome in sorted(known - now):
-        yield one_line(f"    - {outcome.value} {rule}: {subject}")

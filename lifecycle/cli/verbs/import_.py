@@ -9,9 +9,9 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import output_option, parse_assignments, write_text
+from lifecycle.cli.common import output_option, parse_assignments, say, write_text
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import lines, one_line
+from lifecycle.printable import one_line
 
 
 @click.command("import")
@@ -52,7 +52,7 @@ def command(
         schema=schema_reference(folder),
     )
     for gap in gaps_of(found):
-        click.echo(one_line(f"gap: {gap}"), err=True)
+        say(one_line(f"gap: {gap}"))
     if output is None:
         click.echo(text, nl=False)
         return ExitCode.OK
@@ -60,10 +60,10 @@ def command(
     try:
         warnings = load(output).warnings
     except ManifestError as error:
-        click.echo(lines(str(error)), err=True)
+        say(str(error))
         return ExitCode.MANIFEST_INVALID
     for each in warnings:
-        click.echo(lines(str(each)), err=True)
+        say(str(each))
     return ExitCode.OK
 
 

@@ -6,13 +6,7 @@ import shutil
 
 import click
 
-from lifecycle.cli.common import (
-    format_option,
-    json_of,
-    load_plan,
-    manifest_arguments,
-    run_commands_option,
-)
+from lifecycle.cli import common
 from lifecycle.errors import ExitCode
 from lifecycle.plan.model import Plan
 from lifecycle.plan.processes import without_secrets
@@ -20,9 +14,9 @@ from lifecycle.plan.render import render_text
 
 
 @click.command("plan")
-@manifest_arguments
-@format_option("text", "json", "mermaid", "svg", "html")
-@run_commands_option
+@common.manifest_arguments
+@common.format_option("text", "json", "mermaid", "svg", "html")
+@common.run_commands_option
 def command(
     *, manifest: str, assignments: tuple[str, ...], format_: str, run_commands: bool
 ) -> int:
@@ -31,7 +25,7 @@ def command(
     Starts nothing and needs no ROS. The other formats draw it, as `lifecycle graph` draws what runs
     beside it: mermaid for Markdown, svg and html for a browser.
     """
-    plan = load_plan(manifest, assignments, run_commands=run_commands)
+    plan = common.load_plan(manifest, assignments, run_commands=run_commands)
     click.echo(render(plan, format_).rstrip("\n"))
     return ExitCode.OK
 
@@ -41,7 +35,7 @@ def render(plan: Plan, format_: str) -> str:
     if format_ == "text":
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
-        return json_of(without_secrets(plan))
+        return common.json_of(without_secrets(plan))
     from lifecycle.export.picture import build_picture
     from lifecycle.export.picture_writers import WRITERS
 

@@ -8,10 +8,7 @@ from pathlib import Path
 import click
 import msgspec
 
-from lifecycle.cli.common import (
-    format_option,
-    json_of,
-)
+from lifecycle.cli.common import format_option, json_of
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
 from lifecycle.network.ports import (

@@ -11,9 +11,9 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import completing, load_plan
+from lifecycle.cli.common import completing, load_plan, say
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
+from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
 from lifecycle.plan.build import find_node
@@ -57,8 +57,13 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
         raise UsageError(
             f"cannot run {planned.full_name}: it is attached, and started outside of the manifest"
         )
-    if planned.run.resources is not None:
-        _say_unlimited(planned.full_name, planned.run.resources)
+    resources = planned.run.resources.properties() if planned.run.resources is not None else ()
+    if resources:
+        scope = "".join(f" -p {each}" for each in resources)
+        say(
+            f"warning: the resources of {planned.full_name} are not limited here, as by lifecycle "
+            f"up: systemd-run --user --scope{scope} lifecycle run ..."
+        )
     if planned.run.limits:
         limit_resources(planned.run.limits.resources())
     if planned.run.no_new_privileges:
@@ -66,17 +71,6 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     if planned.run.kind is RunKind.COMMAND:
         _replace_process(plan, planned, words[split:])
     return _run_class(plan, planned, list(words[split:]), lifecycle="auto" if auto else "manual")
-
-
-def _say_unlimited(name: str, resources: Resources) -> None:
-    """Say that nothing limits a node that is run in this terminal, and what would."""
-    properties = "".join(f" -p {each}" for each in resources.properties())
-    if properties:
-        click.echo(
-            f"warning: the resources of {name} are not limited here, as by lifecycle up: "
-            f"systemd-run --user --scope{properties} lifecycle run ...",
-            err=True,
-        )
 
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:

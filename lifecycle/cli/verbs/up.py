@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lifecycle.cli.common import (
-    completing,
-    format_option,
-    load_plan,
-    machine_option,
-    manifest_arguments,
-    network_options,
-    read_networks,
-    timeout_option,
-)
+from lifecycle.cli import common
 from lifecycle.cli.report import ReportFile, report_option
 from lifecycle.errors import ExitCode
 
@@ -29,8 +20,8 @@ if TYPE_CHECKING:
 
 
 @click.command("up")
-@manifest_arguments
-@format_option("text", "json")
+@common.manifest_arguments
+@common.format_option("text", "json")
 @click.option(
     "--until",
     type=click.Choice(["connected", "verified", "active"]),
@@ -44,14 +35,14 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
-@timeout_option(
+@common.timeout_option(
     None,
     "For everything from the first start to the system being active.",
     default="30, and 1 for each process",
 )
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
-@machine_option("Run only this machine's nodes; default: all whose address is this host's.")
+@common.machine_option("Run only this machine's nodes; default: all whose address is this host's.")
 @click.option(
     "--keep-going",
     is_flag=True,
@@ -62,7 +53,7 @@ if TYPE_CHECKING:
     "without",
     multiple=True,
     metavar="NODE",
-    shell_complete=completing("nodes"),
+    shell_complete=common.completing("nodes"),
     help="Do not start it, but wait for it: `lifecycle run MANIFEST NODE --manual`, in a debugger. "
     "May be given several times.",
 )
@@ -78,9 +69,11 @@ if TYPE_CHECKING:
     metavar="ID",
     help="The domain, in the place of the manifest's.",
 )
-@network_options(
+@common.network_options(
     "--program",
-    "Program this network with the verified flows while active; may be given several times.",
+    "targets",
+    help_="Program this network with the verified flows while active; may be given several times.",
+    multiple=True,
 )
 def command(
     *,
@@ -119,11 +112,11 @@ def command(
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            program, treatment = read_networks(targets, rest, option="--program")
+            program, treatment = common.read_networks(targets, rest, option="--program")
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
-                plan = load_plan(manifest, assignments, machine=machine, domain_id=domain)
+                plan = common.load_plan(manifest, assignments, machine=machine, domain_id=domain)
                 if without:
                     from lifecycle.plan.build import started_by_others
 
@@ -165,7 +158,7 @@ def command(
             finally:
                 process.close()
     except Ended as ended:
-        click.echo(f"ended before anything was started: {ended.reason}", err=True)
+        common.say(f"ended before anything was started: {ended.reason}")
         return ended.exit_code
 
 

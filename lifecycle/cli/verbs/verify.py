@@ -7,25 +7,14 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import (
-    format_option,
-    load_plan,
-    manifest_arguments,
-    timeout_option,
-)
-from lifecycle.cli.report import (
-    ReportFile,
-    exit_code,
-    format_verdict,
-    report_option,
-)
-from lifecycle.printable import lines
+from lifecycle.cli import common
+from lifecycle.cli.report import ReportFile, exit_code, format_verdict, report_option
 
 
 @click.command("verify")
-@manifest_arguments
-@format_option("text", "json", "junit", "sarif", "github")
-@timeout_option(5.0, "How long a graph that is not ok may still become so.")
+@common.manifest_arguments
+@common.format_option("text", "json", "junit", "sarif", "github")
+@common.timeout_option(5.0, "How long a graph that is not ok may still become so.")
 @click.option("--strict", is_flag=True, help="Exit 5 if anything could not be verified.")
 @report_option
 def command(  # noqa: PLR0917 - click passes options by name
@@ -51,18 +40,18 @@ def command(  # noqa: PLR0917 - click passes options by name
         ):
             from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
-            plan = load_plan(manifest, assignments)
+            plan = common.load_plan(manifest, assignments)
             written.begin(plan)
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             seen = with_supervisors_numbers(seen)
             with ending.noted():
                 unwritten = written.end(seen.verdict)
     except Ended as ended:
-        click.echo(f"ended before it was judged: {ended.reason}", err=True)
+        common.say(f"ended before it was judged: {ended.reason}")
         return ended.exit_code
     # From here on a signal ends what waits for a reader.
     for each in seen.notices:
-        click.echo(lines(each), err=True)
+        common.say(each)
     colour = format_ == "text" and sys.stdout.isatty()
     text = format_verdict(seen.verdict, plan, format_, colour=colour, strict=strict)
     click.echo(text.rstrip("\n"))

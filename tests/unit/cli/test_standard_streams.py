@@ -16,7 +16,7 @@ _PROGRAM = """
 import os
 from lifecycle.cli.standard_streams import own_streams
 print("before")
-streams = own_streams()
+own_streams()
 os.write(1, b"a library\\n")
 os.system("echo a child")
 print("ours", flush=True)
@@ -36,10 +36,10 @@ def test_what_libraries_and_children_print_goes_to_standard_error() -> None:
 def test_streams_that_are_closed_become_none_of_the_files_that_are_opened_later() -> None:
     program = (
         "from lifecycle.cli.standard_streams import own_streams\n"
-        "streams = own_streams()\n"
+        "settled = own_streams()\n"
         "print('nowhere')\n"
         "assert open('/dev/null').fileno() > 2\n"
-        "raise SystemExit(streams.settled(4))\n"
+        "raise SystemExit(settled(4))\n"
     )
     done = subprocess.run(
         ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", program], check=False

@@ -8,8 +8,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from lifecycle.cli import main
-from lifecycle.cli.verbs import check
+from lifecycle.cli import common, main
 from lifecycle.manifest.schema import read_schema
 from lifecycle.plan.programs import Resolution
 
@@ -25,7 +24,7 @@ def corpus(monkeypatch: pytest.MonkeyPatch, without_programs: None) -> None:
 @pytest.fixture
 def without_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look for nothing that nodes run: what manifests of the corpus run is made up."""
-    monkeypatch.setattr(check, "resolve", lambda *_: Resolution())
+    monkeypatch.setattr(common, "resolve", lambda *_: Resolution())
 
 
 @pytest.mark.usefixtures("corpus")

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from lifecycle.cli import common
 from lifecycle.cli.verbs import up
 from lifecycle.errors import ExitCode, UsageError
 
@@ -43,7 +44,7 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text("manifest_version: 1\nsystem: s\n")
     monkeypatch.setattr(FORK_SERVER, _NoForkServer)
-    monkeypatch.setattr(up, "load_plan", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr(common, "load_plan", lambda *_, **__: signal.raise_signal(number))
     report = tmp_path / "report.json"
     words = [str(manifest), "--report", str(report)]
     result = CliRunner().invoke(up.command, words, standalone_mode=False)

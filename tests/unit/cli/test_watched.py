@@ -17,13 +17,13 @@ PROGRAM = """
 import time
 
 from lifecycle.cli import main
-from lifecycle.cli.standard_streams import Watched
+from lifecycle.cli.standard_streams import watched
 
 # Wide characters, and what is too wide and too long for the terminal.
 text = "\\n".join(f"{number:3} " + "界" * 60 + "." * 60 for number in range(1, 101))
-with Watched() as shown:
-    shown.show("first")
-    shown.show(text)
+with watched() as show:
+    show("first")
+    show(text)
     while True:
         time.sleep(0.5)  # a signal just before it is handled after it
 """
