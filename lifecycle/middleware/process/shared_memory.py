@@ -149,9 +149,18 @@ def _locked(files: Iterable[Path]) -> Iterator[None]:
 
 
 def _mapped_by_any() -> set[str]:
-    """Return the groups of which any process has a file mapped."""
+    """Return the groups of which any process has a file mapped.
+
+    A container may have a directory of its own there, with files of the same names.
+    """
     processes = filter(str.isdigit, os.listdir("/proc"))  # noqa: PTH208 - names
-    return set().union(*map(_mapped, processes))
+    return set().union(*(_mapped(each) for each in processes if _shares_directory(each)))
+
+
+def _shares_directory(process: str) -> bool:
+    with contextlib.suppress(OSError):  # it has ended, or is another user's
+        return os.path.samefile(f"/proc/{process}/root{_DIRECTORY}", _DIRECTORY)  # noqa: PTH121
+    return False
 
 
 @contextlib.contextmanager
