@@ -17,7 +17,7 @@ import msgspec
 
 from lifecycle.codec import Count, says
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
-from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, ERROR, Delays, Sample
+from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, ERROR, Delays, Sample, Slot
 from lifecycle.printable import count
 
 RATE_S = 2.0
@@ -73,8 +73,8 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
         observed: `delay p99 0.6 ms`; empty while nothing is known.
         allowed: `≤ 5 ms`.
         share: what was observed, divided by the bound; None while nothing is known.
-        decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
-            where that is not known.
+        decides_in_s: about how long it takes yet until a sample can decide, 0 while nothing shows
+            that it takes long; None if it can, or where that is not known.
         needs_clocks: the sample is large enough to decide, but too little is known of the clocks of
             the two hosts.
     """
@@ -139,6 +139,8 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         decides_in_s = CLOCKS_S - sample.seconds
     elif not is_enough and delays.seconds < DELAY_S:
         decides_in_s = DELAY_S - delays.seconds
+    elif not sample.messages:
+        decides_in_s = 0.0
     return Judgement(
         kept=kept,
         observed=observed,
@@ -197,13 +199,15 @@ def _loss(bound: Bound, sample: Sample) -> Judgement:
     while kept is None and seen.published >= needed:
         needed *= 2
         seen, kept = sample.last(published=needed), _loses_less(bound.most, needed, sample)
-    left = needed - seen.published
+    # How often it is published shows once it has been for a while.
+    flows = Slot.of(each for each in sample.slots if each.messages)
+    left_s = (needed - seen.published) / flows.rate_hz if flows.seconds >= RATE_S else 0.0
     return Judgement(
         kept=kept,
         observed=lost(seen.lost, seen.published) if seen.published else "",
         allowed=_limit("≤", ">", kept, f"{bound.most:.6g}"),
         share=seen.lost / seen.published / bound.most if seen.published else None,
-        decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
+        decides_in_s=left_s if kept is None else None,
     )
 
 

@@ -153,9 +153,14 @@ def _locked(files: Iterable[Path]) -> Iterator[None]:
 
 
 def _mapped(process: str) -> frozenset[str]:
-    """Return the groups of which a process has a file mapped that still has its name."""
+    """Return the groups of which a process has a file mapped that still has its name.
+
+    A container may have a directory of its own there, with files of the same names.
+    """
     own, found = f" {_DIRECTORY}/", set[str]()
     with contextlib.suppress(OSError):  # it has ended, or is another user's
+        if not os.path.samefile(f"/proc/{process}/root{_DIRECTORY}", _DIRECTORY):  # noqa: PTH121
+            return frozenset()
         for line in Path(f"/proc/{process}/maps").read_text(errors="replace").splitlines():
             if own in line:
                 found.add(_group(line.rpartition("/")[2]))

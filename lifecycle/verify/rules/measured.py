@@ -505,6 +505,8 @@ def _sample(view: View, flow: FlowView) -> Sample | None:
     configuration = facts.configuration
     if configuration is None or not facts.is_ours:
         return None
+    if facts.node.run.executor is Executor.EVENTS:
+        return None  # it counts nothing
     measured = configuration.measured
     found = None if measured is None else measured.of(flow.planned.topic)
     return found or Sample(seconds=0.0)  # it has not reported yet

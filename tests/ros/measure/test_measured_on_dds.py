@@ -136,6 +136,16 @@ def test_a_violated_number_takes_a_strict_system_back_to_inactive(
         assert run.finish() == ExitCode.VIOLATED
 
 
+def test_a_run_for_some_seconds_waits_until_a_loss_alone_is_decided(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest, fault = system(tmp_path, fresh_domain, bounds={"loss": 0.05})
+    fault.write_text("lossy")
+    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
+        assert run.finish() == ExitCode.VIOLATED
+        assert [each["rule"] for each in run.verdict["findings"]] == ["flow.loss"]
+
+
 def test_what_is_to_be_done_about_a_violated_number_is_done(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -359,7 +359,10 @@ def test_a_judgement_has_what_share_of_the_bound_was_measured(
         (Bound(kind=Kind.RATE, least=1.0), 1, 5, None, 15.0),
         (RATE, 15, 60, 1.0, 3.0),
         (LOSS, 100, 5, None, 5.0),
-        (LOSS, 0.1, 1, None, None),
+        (LOSS, 0.1, 1, None, 0.0),
+        (LOSS, 4, 5, None, 245.0),
+        (LOSS, 100, 0, None, 0.0),
+        (DELAY, 100, 0, None, 5.0),
         (Bound(kind=Kind.SILENCE, most=2.5), 0.1, 1, None, 1.5),
     ],
 )

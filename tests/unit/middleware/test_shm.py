@@ -7,6 +7,8 @@ import ctypes
 import fcntl
 import mmap
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -86,6 +88,24 @@ def test_a_held_lock_keeps_its_group(directory: Path, kind: str, how: int) -> No
         fcntl.flock(file, how)
         assert sweep() == ()
     assert sweep() == (SEGMENT, lock)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="to mount a file system needs root")
+def test_what_a_container_maps_in_a_directory_of_its_own_keeps_nothing(directory: Path) -> None:
+    make(directory, *GROUP)
+    mount = 'mount -t tmpfs none "$1" && echo data > "$1/$2" && exec "$0" -c "$3" "$1/$2"'
+    code = (
+        "import mmap, sys; file = open(sys.argv[1], 'r+b')\n"
+        "kept = mmap.mmap(file.fileno(), 0); print(); sys.stdin.read()"
+    )
+    command = ("unshare", "--mount", "sh", "-c", mount, sys.executable, directory, PORT, code)
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as container:
+        assert container.stdout is not None
+        container.stdout.readline()
+        try:
+            assert sweep() == tuple(sorted(GROUP))
+        finally:
+            container.communicate()
 
 
 def test_a_dead_owners_segment_goes_although_a_reader_still_maps_it(directory: Path) -> None:
