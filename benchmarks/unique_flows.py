@@ -63,7 +63,7 @@ def measure(kind: str, count: int) -> NoReturn:
     from std_msgs.msg import String
 
     from lifecycle.manifest.qos import QosProfile
-    from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
+    from lifecycle.middleware.fastdds.nfe import create_subscription
     from lifecycle.middleware.fastdds.participant import FlowParticipant
     from lifecycle.middleware.process.control import leave_and_exit
     from lifecycle.network.nfe import UniqueRequirement
@@ -94,7 +94,7 @@ def measure(kind: str, count: int) -> NoReturn:
         "subscription": lambda number: subscription(number, UniqueRequirement.NOT_REQUIRED),
         "unique_subscription": lambda number: subscription(number, strictly),
         "participant_subscription": listener,
-        "publisher": lambda number: create_publisher(node, String, f"/t{number}", qos),
+        "publisher": lambda number: node.create_publisher(String, f"/t{number}", 10),
         "participant": publisher,
         "marked_participant": lambda number: publisher(number, dscp=46),
         "udp_participant": lambda number: publisher(

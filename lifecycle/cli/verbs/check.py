@@ -115,8 +115,7 @@ def _problem(found: Diagnostic, *, fails: bool = False) -> Problem:
 def _junit(report: CheckReport, *, strict: bool) -> str:
     of_test: dict[str, list[Diagnostic]] = {name: [] for name in TESTS}
     for each in report.diagnostics:
-        covers = (name for name, begin in TESTS.items() if each.rule.startswith(begin))
-        of_test[next(covers, "system")].append(each)
+        of_test[_test(each.rule)].append(each)
     cases = []
     for name, found in of_test.items():
         bad = [
@@ -136,6 +135,10 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
             )
         )
     return junit([Suite(name=f"lifecycle check {report.manifest}", cases=cases)])
+
+
+def _test(rule: str) -> str:
+    return next((name for name, begin in TESTS.items() if rule.startswith(begin)), "system")
 
 
 def _sarif(report: CheckReport) -> str:

@@ -286,6 +286,13 @@ class GraphObserver:
             for each in endpoints_of(self.node, EndpointKind.SERVICE_SERVER, service)
         )
 
+    def serves(self, service: str) -> bool:
+        """Return whether a process that has not ended offers a service (fully qualified name)."""
+        if not OVER_DDS:
+            return bool(self.node.count_services(service))
+        offered = endpoints_of(self.node, EndpointKind.SERVICE_SERVER, service)
+        return not all(map(self._is_dead, offered))
+
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""
         listed = endpoints_of_node(self.node, EndpointKind.SERVICE_SERVER, node)

@@ -133,14 +133,19 @@ class ServiceCalls:
         return client
 
     async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
-        """Return a client matched with all servers, or long enough with some; None if none came."""
+        """Return a client matched with all servers, or long enough with some; None if none came.
+
+        What the server of an ended process is sent, which discovery shows still, nobody answers.
+        """
         loop = asyncio.get_running_loop()
         offered_s: float | None = None
-        # Made anew where the node has left, and comes again, meanwhile.
-        while not (client := self._client(service, type_)).service_is_ready():
-            now_s = loop.time()
-            if not self._observer.node.count_services(service):
+        while True:
+            # Made anew where the node has left, and comes again, meanwhile.
+            client, now_s = self._client(service, type_), loop.time()
+            if not self._observer.serves(service):
                 offered_s = None
+            elif client.service_is_ready():
+                break
             elif offered_s is None:
                 offered_s = now_s
             is_late = now_s >= deadline

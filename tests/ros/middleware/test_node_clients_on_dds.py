@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -254,6 +257,46 @@ def test_a_question_to_a_node_that_comes_outlives_one_of_its_name_that_is_seen_t
         return await asking
 
     assert run(ask()) == "unconfigured"
+
+
+MANAGED = """
+import rclpy
+from rclpy.lifecycle import LifecycleNode
+rclpy.init()
+rclpy.spin(LifecycleNode("twice"))
+"""
+
+
+def test_a_request_that_may_not_be_repeated_waits_for_the_successor_of_a_killed_process(
+    clients: NodeClients, observer: GraphObserver, domain_id: int, wait_until: WaitUntil
+) -> None:
+    """Discovery shows the killed one until its lease ends; nobody answers what that is sent."""
+
+    def start() -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+        return subprocess.Popen([sys.executable, "-c", MANAGED], env=environment)
+
+    async def ask() -> bool:
+        asking = clients.change_state("/twice", "configure", timeout_s=BOUND_S)
+        task = asyncio.ensure_future(asking)
+        await asyncio.sleep(0.5)
+        processes.append(start())
+        return await task
+
+    processes = [start()]
+    try:
+        assert run(clients.get_state("/twice", timeout_s=BOUND_S)) == "unconfigured"
+        assert run(clients.change_state("/twice", "configure", timeout_s=BOUND_S))
+        processes[0].kill()
+        processes[0].wait()
+        observer.ended(processes[0].pid, nodes=["/twice"], reported=())
+        assert observer.node.count_services("/twice/change_state") == 1
+        assert run(ask()) is True
+        assert run(clients.get_state("/twice", timeout_s=BOUND_S)) == "inactive"
+    finally:
+        for each in processes:
+            each.kill()
+            each.wait()
 
 
 def test_a_question_that_waits_ends_with_the_clients(clients: NodeClients) -> None:
