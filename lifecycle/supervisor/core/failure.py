@@ -162,7 +162,7 @@ def too_late(run: Run, node: Node, limit_s: float, where: str = "") -> Failure:
     what = doing(run, node)
     at = f", in {where}" if where else ""
     text = f"cannot bring up {node.name!r}: it was still {what} after {limit_s:g} s{at}"
-    text += _advice(run, node)
+    text += advice(run, node)
     return _failure(DEADLINE, node.name, text, run.process_of(node))
 
 
@@ -179,11 +179,11 @@ def say_slow(run: Run) -> list[Event]:
             left_s = late_at_s(request) - run.now_s
             limit = f", for up to {left_s:.0f} s more" if left_s < NEVER_S else ""
             text = f"{node.name!r} is still {what}{limit}"
-            said.append(Notice(message=text + _advice(run, node)))
+            said.append(Notice(message=text + advice(run, node)))
     return said
 
 
-def _advice(run: Run, node: Node) -> str:
+def advice(run: Run, node: Node) -> str:
     """Say what key of the manifest may mend that a node is not found; empty where none may."""
     if doing(run, node) == _UNMANAGED:
         return f"; if it is a plain node, write 'managed: false' at nodes.{node.key}"
@@ -523,7 +523,7 @@ def fail_late(run: Run, why: str) -> list[Event]:
     subject = run.plan.system if culprit is None else culprit.name
     why = unfinished(run) or why
     text = f"cannot bring up {run.plan.system!r} within {run.timeout_s:.3g} s: {why}"
-    text += next(filter(None, (_advice(run, each) for each in run.nodes.values())), "")
+    text += next(filter(None, (advice(run, each) for each in run.nodes.values())), "")
     for node in busy:
         node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)

@@ -195,6 +195,7 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     node = run.nodes.get(given.node)
     if node is None or node.request is None or node.request.number != given.number:
         return []  # it was given up
+    error = given.error and given.error + failure.advice(run, node)
     step, node.request, was = node.request.step, None, node.level
     goal = advance.goal_of(run, node)
     run.changed()
@@ -203,9 +204,9 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
         if run.passage is not None:
             run.passage.sent.discard(node.key)
         return []
-    if given.error:
-        return _step_failed(run, node, step, given, goal)
     node.level = given.level
+    if error:
+        return _step_failed(run, node, step, error, goal)
     if step in UP.values() and step is not Step.ACTIVATE:
         run.came = True
     if step in UP.values():
@@ -233,18 +234,15 @@ def _is_there(run: Run, node: Node) -> None:
         process.state = ProcessState.RUNNING
 
 
-def _step_failed(
-    run: Run, node: Node, step: Step, given: messages.Replied, goal: Level
-) -> list[Event]:
-    node.level = given.level
+def _step_failed(run: Run, node: Node, step: Step, error: str, goal: Level) -> list[Event]:
     is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
     if not is_up:
         node.level = node.after(step)  # the next step is tried all the same
     if not is_up or run.ending is not None:
-        return [Notice(message=given.error)]
+        return [Notice(message=error)]
     rules = {Step.START: START_FAILED, Step.WIRE: NOT_WIRED}
     what = rules.get(step, TRANSITION_FAILED)
-    return failure.fail(run, failure.of_step(run, node, what, given.error))
+    return failure.fail(run, failure.of_step(run, node, what, error))
 
 
 def _saw(run: Run, given: messages.Saw) -> list[Event]:

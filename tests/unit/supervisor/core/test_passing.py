@@ -90,6 +90,18 @@ def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_m
     assert play.failures == [("/driver", late)]
 
 
+def test_that_key_is_named_too_where_the_node_is_given_up_a_moment_before_its_time_is_over() -> (
+    None
+):
+    play = Play(
+        plan_of(planned_node("driver", kind=RunKind.COMMAND)), ways={"driver start": "hang"}
+    )
+    play.give(messages.Saw(appeared=frozenset({"driver"})))
+    play.finish("driver start", error="cannot call its service")
+    ((_, said),) = play.failures
+    assert said.endswith("service; if it is a plain node, write 'managed: false' at nodes.driver")
+
+
 @pytest.mark.parametrize(
     ("status", "kind", "said"),
     [
