@@ -43,6 +43,8 @@ _POSITIONAL = {
     EndpointKind.SUBSCRIPTION: ("msg_type", "topic", "callback", "qos_profile"),
 }
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
+_UNSAID = ("undeclare_parameter", "set_descriptor")
+"""They change the parameters of a node, and rclpy publishes no event of it."""
 _ACTIONS = {
     ("rclpy.action.server", "ActionServer"): EndpointKind.ACTION_SERVER,
     ("rclpy.action.client", "ActionClient"): EndpointKind.ACTION_CLIENT,
@@ -60,6 +62,9 @@ class NodeHooks(Protocol):
 
     def removed(self, entity: Any) -> None:
         """An entity is about to be destroyed."""
+
+    def parameters_changed(self) -> None:
+        """Its parameters have changed, and no event says so."""
 
     def close(self) -> None:
         """The node is about to be destroyed."""
@@ -102,6 +107,7 @@ def follow_nodes(constructing: Constructing, hooks_of: HooksOf) -> Callable[[], 
     }
     wrapped |= {name: _noting(getattr(Node, name), kind, hooks_of) for name, kind in _FACTORIES}
     wrapped |= {name: _forgetting(getattr(Node, name), hooks_of) for name in _REMOVERS}
+    wrapped |= {name: _telling(getattr(Node, name), hooks_of) for name in _UNSAID}
     before = {name: getattr(Node, name) for name in wrapped}
 
     def put(methods: Mapping[str, Callable[..., Any]]) -> None:
@@ -140,6 +146,17 @@ def _forgetting(destroy: Callable[..., Any], hooks_of: HooksOf) -> Callable[...,
         return destroy(self, entity)
 
     return remove
+
+
+def _telling(change: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:
+    @functools.wraps(change)
+    def tell(self: Node, *arguments: Any, **options: Any) -> Any:
+        result = change(self, *arguments, **options)
+        if (hooks := hooks_of(self)) is not None:
+            hooks.parameters_changed()
+        return result
+
+    return tell
 
 
 def _noting_actions(add: Callable[..., Any], hooks_of: HooksOf) -> Callable[..., Any]:

@@ -221,6 +221,10 @@ class ForeignNode(NodeInHost):
         if isinstance(entity, Publisher) and placement.connection.participant is not None:
             placement.connection.participant.destroy_endpoint(entity)
 
+    def parameters_changed(self) -> None:
+        """Report it: rclpy does not publish this change."""
+        self.configuration_changes.touch()
+
     def constructed(self) -> None:
         """Its class's constructor has returned: hold it, or have it spun."""
         self._is_constructed = True
