@@ -264,11 +264,7 @@ def program() -> int:
         return main()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    code = own_streams(waits=verb != ["up"])(main())
-    if verb == ["up"]:
-        # The interpreter takes a moment to end, and the reported result of the run is final.
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)
+    code = own_streams(waits=verb != ["up"])(main(is_program=True))
     if "rclpy" in sys.modules:
         from lifecycle.middleware.fastdds.prober import leave_all
         from lifecycle.middleware.process.shared_memory import holds_shared_memory
@@ -292,14 +288,20 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     signal.default_int_handler(number, frame)
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, *, is_program: bool = False) -> int:
     """Run the command line; the one place where exceptions become exit codes.
+
+    Args:
+        arguments: those of the process if left out.
+        is_program: the process ends with it; verbs have this as `obj` of their context.
 
     Returns:
         The exit code, see `lifecycle.errors.ExitCode`.
     """
     try:
-        result = cli.main(args=arguments, prog_name="lifecycle", standalone_mode=False)
+        result = cli.main(
+            args=arguments, prog_name="lifecycle", standalone_mode=False, obj=is_program
+        )
     except (click.Abort, KeyboardInterrupt):
         return ExitCode.INTERRUPTED
     except Exception as error:  # noqa: BLE001 - the boundary: report our bug, whatever it is

@@ -25,6 +25,9 @@ RATE_PERIODS = 20
 LOSS_EVENTS = 10
 """A share is known once so many losses would have been seen at the bound."""
 
+LATE_MESSAGES = 2
+"""A quantile of a sample is one of the flow once so many may be late, 2 of 200 for p99."""
+
 CLOCKS_S = 8.0
 """A delay that the clocks of two hosts do not let decide is waited for so long: within the
 probation of a system."""
@@ -126,7 +129,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
             unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
             observed += f" ± {ms(unsure_ms)}"
         is_late = delay_ms - unsure_ms > bound.most
-        if is_late and delays.messages < DELAY_MESSAGES:
+        if is_late and delays.messages < max(DELAY_MESSAGES, LATE_MESSAGES / (1 - bound.quantile)):
             late = delays.later_than(bound.most + unsure_ms - clock.offset_ms)
             is_enough = is_enough and late >= too_many(delays.messages, 1 - bound.quantile)
         if is_enough and is_late:

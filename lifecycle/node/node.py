@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rcl_interfaces.msg import ParameterDescriptor, ParameterValue
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -221,6 +222,17 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's, which notifies nothing; the node's configuration has changed."""
         super().undeclare_parameter(name)
         self.lifecycle.configuration_changes.touch()
+
+    def set_descriptor(
+        self,
+        name: str,
+        descriptor: ParameterDescriptor,
+        alternative_value: ParameterValue | None = None,
+    ) -> ParameterValue:
+        """As rclpy's, which notifies nothing; the node's configuration has changed."""
+        value = super().set_descriptor(name, descriptor, alternative_value)
+        self.lifecycle.configuration_changes.touch()
+        return value
 
     def destroy_node(self) -> None:
         """As rclpy's; participants of its own go with it."""

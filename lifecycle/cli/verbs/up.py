@@ -106,9 +106,11 @@ def command(
     """
     from lifecycle.supervisor.run.signals import Ended, Ending
 
+    is_program = bool(click.get_current_context().obj)
     try:
         with (
-            Ending() as ending,
+            # The reported result of the run is final, and the interpreter takes a moment to end.
+            Ending(is_last=is_program) as ending,
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):

@@ -442,7 +442,9 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
     else:
         is_kept = phase_of(run) in ("measuring", "active", "paused", "pausing")
         asked = code
-        code, why = _outcome(run, "")
+        # What is seen of nodes that an order has on their way is no verdict on the system.
+        is_changing = not is_kept and (run.order or run.change or run.switch) and not run.deaths
+        code, why = (ExitCode.OK, "") if is_changing else _outcome(run, "")
         if asked in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             code = asked
         elif code is ExitCode.OK and run.options.hold_s is not None:

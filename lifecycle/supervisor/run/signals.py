@@ -51,11 +51,15 @@ class Ended(KeyboardInterrupt):
 class Ending:
     """Use it in a `with`, in the main thread; what it found is there again afterwards.
 
+    Args:
+        is_last: nothing comes after it in this process: signals are ignored then.
+
     Attributes:
         number: the first signal that came, and None before.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_last: bool = False) -> None:
+        self._is_last = is_last
         self.number: int | None = None
         self._raises = True
         self._raised = False
@@ -72,7 +76,7 @@ class Ending:
 
     def __exit__(self, *_: object) -> None:
         for number, found in self._found.items():
-            signal.signal(number, found)
+            signal.signal(number, signal.SIG_IGN if self._is_last else found)
 
     @property
     def numbers(self) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ import pytest
 import rclpy
 from lifecycle_driver import Driver
 from planning import built_with, planned
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.parameter import Parameter
 
 from lifecycle import LifecycleNode, codec
@@ -71,12 +71,14 @@ def test_every_parameter_is_reported_as_it_is(driver: Driver) -> None:
 
 def test_each_change_makes_another_checksum_and_is_told(driver: Driver, node: Any) -> None:
     told: list[NodeConfiguration] = []
+    fixed = ParameterDescriptor(type=ParameterType.PARAMETER_INTEGER_ARRAY, read_only=True)
     node.lifecycle.configuration_changes.listen(told.append)
     for change, name in (
         (lambda: node.set_parameters([Parameter("ints", value=[3])]), "ints"),
         (lambda: node.set_parameters([Parameter("any", value=1)]), "any"),
         (lambda: node.declare_parameter("late", 1), "late"),
         (lambda: node.undeclare_parameter("late"), "late"),
+        (lambda: node.set_descriptor("ints", fixed), "ints"),
     ):
         before, count = configuration(driver), len(told)
         change()

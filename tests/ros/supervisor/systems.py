@@ -201,3 +201,16 @@ class Eager(Talker):
             await self.lifecycle.change("activate")
         except LifecycleError as refused:
             print(f"{whence}: {refused}", flush=True)
+
+
+class Forgetful(Node):
+    """Undeclares its parameter once the file FORGET is there."""
+
+    def __init__(self) -> None:
+        super().__init__("arm")
+        self.declare_parameter("gain", 2.5)
+        self.create_timer(0.1, self._look)
+
+    def _look(self) -> None:
+        if self.has_parameter("gain") and Path(os.environ["FORGET"]).exists():
+            self.undeclare_parameter("gain")

@@ -109,6 +109,24 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
         assert "param.missing: /robot/left: mode" in judged.stdout
 
 
+def test_a_plain_node_of_ours_that_undeclares_a_parameter_is_found(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    """Rclpy publishes no event of that."""
+    forgetful = {
+        "run": {
+            "python": "tests.ros.supervisor.systems:Forgetful",
+            "environment": {"FORGET": str(tmp_path / "forget")},
+        },
+        "managed": False,
+        "interface": {"parameters": {"gain": {"type": "double", "default_value": 2.5}}},
+    }
+    with up(system(tmp_path, fresh_domain, forgetful), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        (tmp_path / "forget").touch()
+        run.until_found("param.missing", "/arm: gain")
+
+
 def test_a_node_whose_parameter_is_changed_is_deactivated_until_it_is_resumed(
     tmp_path: Path, fresh_domain: int, set_parameter: Set
 ) -> None:

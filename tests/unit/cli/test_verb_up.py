@@ -80,9 +80,10 @@ def test_a_signal_after_the_end_of_a_run_does_not_change_its_exit_code(
     verb: str, is_ignored: bool
 ) -> None:
     program = (
-        "import signal, sys\n"
+        "import os, signal, sys\n"
         "from lifecycle.cli import program\n"
-        f"sys.argv = ['lifecycle', {verb!r}, '--help']\n"
+        "os._exit = print\n"
+        f"sys.argv = ['lifecycle', {verb!r}, 'missing.lifecycle.yaml']\n"
         "program()\n"
         "numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)\n"
         "ignored = {signal.getsignal(each) is signal.SIG_IGN for each in numbers}\n"

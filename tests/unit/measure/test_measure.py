@@ -203,6 +203,16 @@ def test_a_few_late_messages_of_not_many_decide_nothing(late: int, kept: bool | 
     assert (found.kept, found.needs_clocks, found.decides_in_s) == (kept, False, None)
 
 
+@pytest.mark.parametrize(("late", "kept"), [(1, True), (2, None), (3, False), (200, False)])
+def test_200_messages_are_few_for_a_quantile_that_one_in_a_thousand_may_exceed(
+    late: int, kept: bool | None
+) -> None:
+    bound = Bound(kind=Kind.DELAY, most=5.0, quantile=0.999)
+    delays = ((at_s, number, 100 < number <= 100 + late) for at_s, _, number in steady(100, 3))
+    some = [(at_s, 8.0 if is_late else 1.0, number) for at_s, number, is_late in delays]
+    assert verdict(bound, counted(some, until_s=3)) is kept
+
+
 @given(st.integers(1, 3000), st.sampled_from([0.5, 0.1, 0.05, 0.02, 0.01, 0.001]))
 def test_too_many_late_messages_are_in_about_1_percent_of_samples(
     messages: int, share: float

@@ -110,6 +110,20 @@ def test_what_was_there_before_is_there_again() -> None:
     assert after == before
 
 
+def test_after_the_last_of_a_process_signals_change_nothing() -> None:
+    before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        with Ending(is_last=True) as ending:
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert ending.number is None
+    finally:
+        for number, found in before.items():
+            signal.signal(number, found)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def test_a_run_under_nohup_outlives_its_terminal() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

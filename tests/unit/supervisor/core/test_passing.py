@@ -293,6 +293,12 @@ def _restart(play: Play) -> None:
     play.order(ControlRequest.RESTART, node="viewer")
 
 
+def _restart_and_see(play: Play) -> None:
+    _restart(play)
+    play.see(INTRUDER)
+    play.wait(0.5)
+
+
 def _violate(play: Play) -> None:
     play.see(INTRUDER)
     play.wait(2.0)
@@ -313,6 +319,7 @@ def _hold(play: Play) -> None:
         (lambda _: None, 0, ""),
         (_pause, 0, ""),
         (_restart, 143, "; the system was restarting, not active"),
+        (_restart_and_see, 143, f"; the system was restarting, not active; {PASSED}"),
         (_violate, 0, f"; violated meanwhile, wrong: {STRANGER}"),
         (_hold, 4, f"; held at the gate, and not active; {PASSED}"),
     ],
