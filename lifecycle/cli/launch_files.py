@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from lifecycle.errors import UsageError
-from lifecycle.export.manifest_yaml import Noted, Tree, comment, literal, to_yaml
+from lifecycle.export.manifest_yaml import Noted, Tree, comment, kept, literal, to_yaml
 from lifecycle.export.programs import LOG_LEVELS
 from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.names import free_name
@@ -454,32 +454,31 @@ def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
 
 def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
     container = {"container": by_name.get(node.container, node.container)} if node.container else {}
-    tree: dict[str, Tree] = {"run": {**node.run, **container}}
     gaps = [*node.gaps]
-    if node.name:
-        tree["name"] = node.name  # written even if it is the key: only then a command is given it
-    else:
+    if not node.name:
         gaps.insert(0, "launch leaves its name to its code; the key must be that name")
-    if node.namespace != "/":
-        tree["namespace"] = node.namespace
-    if not node.managed:
-        note = "launch does not say whether it has a lifecycle; remove this line if it has"
-        tree["managed"] = Noted(value=False, note=f"gap: {note}")
-    files = [literal(os.path.relpath(each, folder)) for each in node.parameter_files]
-    if files:
-        tree["parameter_files"] = files
-    if node.parameters:
-        tree["parameters"] = {
-            name: [literal(each) for each in value] if isinstance(value, tuple) else literal(value)
-            for name, value in node.parameters.items()
+    unknown = "launch does not say whether it has a lifecycle; remove this line if it has"
+    silent = "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
+    tree = kept(
+        {
+            "run": {**node.run, **container},
+            # Written even if it is the key: only then a command is given it.
+            "name": node.name,
+            "namespace": "" if node.namespace == "/" else node.namespace,
+            "managed": None if node.managed else Noted(value=False, note=f"gap: {unknown}"),
+            "parameter_files": [
+                literal(os.path.relpath(each, folder)) for each in node.parameter_files
+            ],
+            "parameters": {
+                name: list(map(literal, value)) if isinstance(value, tuple) else literal(value)
+                for name, value in node.parameters.items()
+            },
+            "remap": {source: literal(target) for source, target in node.remap.items()},
+            "log_level": node.log_level,
+            **node.restart,
+            "endpoints": Noted(value="open", note=f"gap: {silent}"),
         }
-    if node.remap:
-        tree["remap"] = {source: literal(target) for source, target in node.remap.items()}
-    if node.log_level:
-        tree["log_level"] = node.log_level
-    tree |= node.restart
-    note = "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
-    tree["endpoints"] = Noted(value="open", note=f"gap: {note}")
+    )
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
 
 

@@ -182,119 +182,106 @@ def _gaps(system: CapturedSystem) -> Iterable[str]:
         yield "remaps cannot be seen: names are those in the graph, not those in the nodes' code"
 
 
+def kept(keys: Mapping[str, Tree | None]) -> dict[str, Tree]:
+    """Return the keys that say something: whose values are neither None nor empty."""
+    return {key: each for key, each in keys.items() if each not in (None, "", {}, [], ())}
+
+
 def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {"manifest_version": 1, "system": system.system}
-    if system.machines:
-        tree["machines"] = {
-            each.name: {"address": each.address}
-            if each.address
-            else Noted(value={}, note="gap: its address is not told")
-            for each in system.machines
-        }
-    discovery: dict[str, Tree] = {"domain_id": system.domain_id}
-    if system.discovery_range is not DiscoveryRange.SYSTEM_DEFAULT:
-        discovery["range"] = system.discovery_range.value
-    tree["discovery"] = discovery
-    if policy := _policy(system):
-        tree["policy"] = policy
-    tree["nodes"] = {each.key: _node(each, references.get(each.key, "")) for each in system.nodes}
-    return tree
-
-
-def _policy(system: CapturedSystem) -> dict[str, Tree]:
-    policy: dict[str, Tree] = {}
-    if system.partial:
-        policy["undeclared_nodes"] = Noted(
-            value="open", note="gap: nodes of other namespaces were left out"
-        )
+    unknown = Noted(value={}, note="gap: its address is not told")
     ends = {(each.kind, each.name) for node in system.nodes for each in node.endpoints}
     waiting = {
         name for kind, name in ends if not kind.offers and (kind.other_end, name) not in ends
     }
-    if waiting:
-        note = f"gap: nobody offers {', '.join(sorted(waiting))}"
-        policy["unpublished"] = Noted(value="warning", note=note)
-    return policy
+    policy = {
+        "undeclared_nodes": Noted(value="open", note="gap: nodes of other namespaces were left out")
+        if system.partial
+        else None,
+        "unpublished": Noted(
+            value="warning", note=f"gap: nobody offers {', '.join(sorted(waiting))}"
+        )
+        if waiting
+        else None,
+    }
+    is_default = system.discovery_range is DiscoveryRange.SYSTEM_DEFAULT
+    discovery_range = "" if is_default else system.discovery_range.value
+    return kept(
+        {
+            "manifest_version": 1,
+            "system": system.system,
+            "machines": {
+                each.name: {"address": each.address} if each.address else unknown
+                for each in system.machines
+            },
+            "discovery": kept({"domain_id": system.domain_id, "range": discovery_range}),
+            "policy": kept(policy),
+            "nodes": {each.key: _node(each, references.get(each.key, "")) for each in system.nodes},
+        }
+    )
 
 
 def _node(node: CapturedNode, reference: str) -> Tree:
-    tree = _identity(node)
-    if node.repeated:
-        several = ", ".join(f"{each.kind.value} {each.name}" for each in node.repeated)
-        tree["endpoints"] = Noted(
-            value="open", note=f"gap: it has several {several}; a manifest names each once"
+    run = node.run
+    is_active = node.state not in TARGETS or node.state == TargetState.ACTIVE.value
+    ended = run is not None and run.program.has_ended
+    why = (
+        "it ended while it was captured; its exit status is not seen"
+        if ended
+        else "it only asks others; whether it ends by itself is not seen"
+    )
+    several = ", ".join(f"{each.kind.value} {each.name}" for each in node.repeated)
+    remap = {
+        each.declared: each.name
+        for each in node.endpoints
+        if expand(each.declared, node.name, node.namespace) != each.name
+    }
+    values = {
+        each.name: _value(each, literal) for each in node.parameters or () if can_be_given(each)
+    }
+    needs = {
+        kind.value: kept(
+            {each.declared: _need(each) for each in node.endpoints if each.kind is kind}
         )
-    tree.update(_given(node))
-    interface = reference or _interface(node, spell=literal)
-    if interface:
-        tree["interface"] = interface
-    if flows := _flows(node):
-        tree["flows"] = flows
+        for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
+    }
+    tree = kept(
+        {
+            "run": _run(run) if run else {"attach": True},
+            "process": run.process if run else "",
+            "name": node.name if node.key != node.name or (run and run.names) else "",
+            "machine": node.machine,
+            "namespace": "" if node.namespace == "/" else node.namespace,
+            "managed": node.managed,
+            "state": node.state if node.managed and not is_active else "",
+            "may_end": Noted(value=True, note=f"gap: {why}") if node.may_end else None,
+            "endpoints": Noted(
+                value="open", note=f"gap: it has several {several}; a manifest names each once"
+            )
+            if several
+            else None,
+            "remap": remap | dict(run.remap if run else ()),
+            "parameter_files": run.parameter_files if run else (),
+            "parameters": values if run else {},
+            "log_level": run.log_level if run else "",
+            "interface": reference or _interface(node, spell=literal),
+            "flows": kept(needs),
+        }
+    )
     notes = [f"gap: {each}" for each in node.gaps]
     if node.process_id is not None:
         notes.insert(0, f"pid {node.process_id} when it was captured")
     return Noted(value=tree, note="; ".join(notes)) if notes else tree
 
 
-def _identity(node: CapturedNode) -> dict[str, Tree]:
-    """Return the keys that say what runs, where, and what is expected of it."""
-    run = node.run
-    tree: dict[str, Tree] = {"run": {"attach": True} if run is None else _run(run)}
-    if run is not None and run.process:
-        tree["process"] = run.process
-    if node.key != node.name or (run is not None and run.names):
-        tree["name"] = node.name
-    if node.machine:
-        tree["machine"] = node.machine
-    if node.namespace != "/":
-        tree["namespace"] = node.namespace
-    tree["managed"] = node.managed
-    if node.managed and node.state in TARGETS and node.state != TargetState.ACTIVE.value:
-        tree["state"] = node.state
-    if node.may_end:
-        note = "gap: it only asks others; whether it ends by itself is not seen"
-        if run is not None and run.program.has_ended:
-            note = "gap: it ended while it was captured; its exit status is not seen"
-        tree["may_end"] = Noted(value=True, note=note)
-    return tree
-
-
-def _given(node: CapturedNode) -> dict[str, Tree]:
-    """Return the keys that a node is given: its remaps, parameters and log level."""
-    tree: dict[str, Tree] = {}
-    run = node.run
-    remap = {
-        each.declared: each.name
-        for each in node.endpoints
-        if expand(each.declared, node.name, node.namespace) != each.name
-    }
-    remap.update(run.remap if run else ())
-    if remap:
-        tree["remap"] = remap
-    if run is None:
-        return tree
-    if run.parameter_files:
-        tree["parameter_files"] = run.parameter_files
-    values = {
-        each.name: _value(each, literal) for each in node.parameters or () if can_be_given(each)
-    }
-    if values:
-        tree["parameters"] = values
-    if run.log_level:
-        tree["log_level"] = run.log_level
-    return tree
-
-
 def _run(run: CapturedRun) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {
-        "command": list(map(literal, run.command)),
-        "working_directory": literal(run.program.working_directory),
-    }
-    if run.program.environment:
-        tree["environment"] = {name: str(literal(value)) for name, value in run.program.environment}
-    if run.ros_args is not RosArguments.AUTO:
-        tree["ros_args"] = run.ros_args.value
-    return tree
+    return kept(
+        {
+            "command": list(map(literal, run.command)),
+            "working_directory": literal(run.program.working_directory),
+            "environment": {name: str(literal(value)) for name, value in run.program.environment},
+            "ros_args": "" if run.ros_args is RosArguments.AUTO else run.ros_args.value,
+        }
+    )
 
 
 def _value(parameter: CapturedParameter, spell: _Spell) -> Tree:
@@ -304,19 +291,16 @@ def _value(parameter: CapturedParameter, spell: _Spell) -> Tree:
 
 
 def _interface(node: CapturedNode, *, spell: _Spell) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {}
-    for kind in EndpointKind:
-        entries = [_endpoint(each) for each in node.endpoints if each.kind is kind]
-        if entries:
-            tree[kind.value] = entries
-    parameters = {
+    parameters: dict[str, Tree] = {
         each.name: _parameter(each, spell, given=node.run is not None and can_be_given(each))
         for each in node.parameters or ()
         if each.type
     }
-    if parameters:
-        tree["parameters"] = parameters
-    return tree
+    of_kind: dict[str, Tree] = {
+        kind.value: [_endpoint(each) for each in node.endpoints if each.kind is kind]
+        for kind in EndpointKind
+    }
+    return kept(of_kind | {"parameters": parameters})
 
 
 def _endpoint(endpoint: CapturedEndpoint) -> Tree:
@@ -332,25 +316,24 @@ def _endpoint(endpoint: CapturedEndpoint) -> Tree:
 
 
 def _qos(qos: QosProfile, kind: EndpointKind) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {}
-    if qos.history is History.UNKNOWN:
-        tree["history"] = Noted(value=_UNKNOWN_POLICY, note=f"gap: {_ANNOUNCED}")
-    else:
-        tree["history"] = qos.history.value
-        if qos.history is History.KEEP_LAST:
-            tree["depth"] = qos.depth
-    for name in ("reliability", "durability"):
-        tree[name] = _policy_value(getattr(qos, name).value)
-    for name in ("deadline_ns", "lifespan_ns"):
-        duration = getattr(qos, name)
-        # A DataReader has no lifespan (DDS 1.4 §2.2.3.16).
-        is_reader = name == "lifespan_ns" and kind is EndpointKind.SUBSCRIPTION
-        if duration not in (None, 0, INFINITE_NS) and not is_reader:
-            tree[name] = duration
-    tree["liveliness"] = _policy_value(qos.liveliness.value)
-    if qos.liveliness_lease_duration_ns not in (None, 0, INFINITE_NS):
-        tree["liveliness_lease_duration_ns"] = qos.liveliness_lease_duration_ns
-    return tree
+    def duration_ns(value: int | None) -> int | None:
+        return None if value in (0, INFINITE_NS) else value
+
+    is_reader = kind is EndpointKind.SUBSCRIPTION
+    unknown = Noted(value=_UNKNOWN_POLICY, note=f"gap: {_ANNOUNCED}")
+    return kept(
+        {
+            "history": unknown if qos.history is History.UNKNOWN else qos.history.value,
+            "depth": qos.depth if qos.history is History.KEEP_LAST else None,
+            "reliability": _policy_value(qos.reliability.value),
+            "durability": _policy_value(qos.durability.value),
+            "deadline_ns": duration_ns(qos.deadline_ns),
+            # A DataReader has no lifespan (DDS 1.4 §2.2.3.16).
+            "lifespan_ns": None if is_reader else duration_ns(qos.lifespan_ns),
+            "liveliness": _policy_value(qos.liveliness.value),
+            "liveliness_lease_duration_ns": duration_ns(qos.liveliness_lease_duration_ns),
+        }
+    )
 
 
 def _policy_value(value: str) -> Tree:
@@ -379,30 +362,17 @@ def literal(value: Scalar) -> Scalar:
     return value.replace("$(", "$$(") if isinstance(value, str) else value
 
 
-def _flows(node: CapturedNode) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {}
-    for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
-        needs = {
-            each.declared: need
-            for each in node.endpoints
-            if each.kind is kind and (need := _need(each))
-        }
-        if needs:
-            tree[kind.value] = needs
-    return tree
-
-
 def _need(endpoint: CapturedEndpoint) -> dict[str, Tree]:
-    need: dict[str, Tree] = {}
+    unique: Tree = endpoint.unique.value
     strict = endpoint.unique is UniqueRequirement.STRICTLY_REQUIRED
     if strict and endpoint.kind is EndpointKind.PUBLISHER:
         # A manifest may not ask that of a node that it only attaches to.
-        need["unique"] = Noted(
+        unique = Noted(
             value=UniqueRequirement.OPTIONALLY_REQUIRED.value,
             note="gap: it is strictly_required; only a node with run: python can be asked that",
         )
-    elif endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
-        need["unique"] = endpoint.unique.value
-    if endpoint.dscp is not None:
-        need["dscp"] = Noted(value=endpoint.dscp, note=describe(endpoint.dscp))
-    return need
+    elif endpoint.unique is UniqueRequirement.NOT_REQUIRED:
+        unique = ""
+    dscp = endpoint.dscp
+    marked = None if dscp is None else Noted(value=dscp, note=describe(dscp))
+    return kept({"unique": unique, "dscp": marked})

@@ -10,7 +10,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,10 +50,26 @@ def command(name: str, directory: Path | None) -> int:
     It is a Python package with tests that pass, and a colcon package, too (ament_python). NAME has
     lower-case letters, digits and underscores.
     """
-    _check_name(name)
+    # What both Python and ROS 2 take for a package, REP-144.
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) < 2:
+        what = "write lower-case letters, digits and single underscores, a letter first"
+    elif keyword.iskeyword(name) or name in sys.stdlib_module_names:
+        what = "Python has a module or a keyword of that name"
+    elif name in ("lifecycle", "tests"):
+        what = "it would hide a package that its own tests import"
+    else:
+        what = ""
+    if what:
+        raise UsageError(f"cannot make a package {name!r}: {what}")
     root = Path(name) if directory is None else directory
     files = {root / path: text for path, text in package_files(name).items()}
-    _write_new(root, files)
+    if there := [str(path) for path in files if os.path.lexists(path)]:
+        raise UsageError(
+            f"cannot make a package in {str(root)!r}: {there[0]!r} is there already",
+            hint="give --directory DIRECTORY",
+        )
+    for path, text in files.items():
+        write_text(path, text)
     where = shlex.quote(str(root))
     click.echo(
         f"made {name!r} in {str(root)!r}: {len(files)} files\n"
@@ -81,39 +97,6 @@ def _template(folder: Traversable, path: str, name: str) -> Iterator[tuple[str, 
         elif plain != each.name:
             text = each.read_text(encoding="utf-8").replace(_PLACEHOLDER, name)
             yield f"{path}{renamed}", text
-
-
-def _check_name(name: str) -> None:
-    """Insist on a name that both Python and ROS 2 take for a package, REP-144.
-
-    Raises:
-        UsageError: one of them would not.
-    """
-    what = ""
-    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) < 2:
-        what = "write lower-case letters, digits and single underscores, a letter first"
-    elif keyword.iskeyword(name) or name in sys.stdlib_module_names:
-        what = "Python has a module or a keyword of that name"
-    elif name in ("lifecycle", "tests"):
-        what = "it would hide a package that its own tests import"
-    if what:
-        raise UsageError(f"cannot make a package {name!r}: {what}")
-
-
-def _write_new(root: Path, files: Mapping[Path, str]) -> None:
-    """Write files none of which is there yet.
-
-    Raises:
-        UsageError: one is, or cannot be written.
-    """
-    there = [path for path in files if os.path.lexists(path)]
-    if there:
-        raise UsageError(
-            f"cannot make a package in {str(root)!r}: {str(there[0])!r} is there already",
-            hint="give --directory DIRECTORY",
-        )
-    for path, text in files.items():
-        write_text(path, text)
 
 
 def _schema_text(file: str) -> str:
@@ -146,9 +129,18 @@ def schema_command(name: str, *, to: str | None) -> int:
     schemas = _schemas()
     if name not in schemas:
         raise UsageError(f"cannot find schema {name!r}; there are: {', '.join(schemas)}")
-    if to is not None:
-        return _install(schemas, Path(to) if to else None)
-    click.echo(_schema_text(schemas[name]).rstrip("\n"))
+    if to is None:
+        click.echo(_schema_text(schemas[name]).rstrip("\n"))
+        return ExitCode.OK
+    folder = Path(to) if to else _data_directory()
+    for file in schemas.values():
+        write_text(folder / file, _schema_text(file))
+    manifest = folder / schemas["manifest"]
+    reference = f"{folder.as_posix()}/{manifest.name}" if to else manifest.as_uri()
+    click.echo(
+        f"copied {len(schemas)} schemas to {str(folder)!r}; a manifest begins with\n"
+        f"# yaml-language-server: $schema={reference}"
+    )
     return ExitCode.OK
 
 
@@ -169,16 +161,3 @@ def _data_directory() -> Path:
     """Return where this user's schemas are, XDG Base Directory Specification."""
     data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
     return Path(data).expanduser().absolute() / "lifecycle" / "schemas"
-
-
-def _install(schemas: Mapping[str, str], to: Path | None) -> ExitCode:
-    folder = to or _data_directory()
-    for file in schemas.values():
-        write_text(folder / file, _schema_text(file))
-    manifest = folder / schemas["manifest"]
-    reference = manifest.as_uri() if to is None else f"{to.as_posix()}/{manifest.name}"
-    click.echo(
-        f"copied {len(schemas)} schemas to {str(folder)!r}; a manifest begins with\n"
-        f"# yaml-language-server: $schema={reference}"
-    )
-    return ExitCode.OK
