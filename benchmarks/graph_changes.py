@@ -188,7 +188,7 @@ class Supervised:
         seen = perfect(plan, Stage.ACTIVE)
         self.shown: Any = Shown(seen)
         self._configurations = seen.configurations
-        loop = GraphLoop(own_thread=False)
+        loop = GraphLoop(asyncio.get_running_loop())
         self._graph = Graph(self.shown, None, loop)  # type: ignore[arg-type]
         system: Any = World(plan, folder).system
         peers: Any = Peers(system, None)  # type: ignore[arg-type]

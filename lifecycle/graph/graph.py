@@ -165,8 +165,7 @@ class Graph:
 
     @classmethod
     def _following(cls, discovery: GraphObserver) -> Graph:
-        loop = GraphLoop(own_thread=True)
-        return cls(discovery, NodeClients(discovery), loop, messages=True)
+        return cls(discovery, NodeClients(discovery), GraphLoop(), messages=True)
 
     @classmethod
     def in_loop(
@@ -179,8 +178,8 @@ class Graph:
     ) -> Graph:
         """Look at the graph of a domain with a participant of its own, as a supervisor does.
 
-        Make it before starting what is to be observed. All runs in the asyncio loop in which the
-        graph is first used; nodes are asked when `observe` is called, and then only.
+        Make it before starting what is to be observed. All runs in the asyncio loop that runs here;
+        nodes are asked when `observe` is called, and then only.
 
         Args:
             domain_id: 0–232.
@@ -192,7 +191,7 @@ class Graph:
             MiddlewareError: no participant could be made.
         """
         discovery = GraphObserver(domain_id, connections)
-        loop = GraphLoop(own_thread=False)
+        loop = GraphLoop(asyncio.get_running_loop())
         return cls(discovery, NodeClients(discovery), loop, messages=messages, unplanned=unplanned)
 
     # -- one observation
@@ -219,7 +218,6 @@ class Graph:
         Raises:
             MiddlewareError: the graph can no longer be watched.
         """
-        self._loop.bind()
         planned = {node.full_name for node in plan.nodes}
         names = DeclaredNames.of(plan)
         while True:
@@ -282,7 +280,7 @@ class Graph:
         Discovery, a transition or a parameter of a node that is asked, or a status of one that
         changed makes a change; a configuration that is put into the state makes none.
         """
-        loop = self._loop.bind()
+        loop = self._loop.loop
         await self._changed.wait()
         end = loop.time() + _BURST_S
         while (left_s := end - loop.time()) > 0:
@@ -301,7 +299,7 @@ class Graph:
         """
         if not self._loop.has_thread:
             raise TypeError("cannot wait for an observation in its own loop; await observe(plan)")
-        return asyncio.run_coroutine_threadsafe(self.observe(plan), self._loop.bind()).result()
+        return asyncio.run_coroutine_threadsafe(self.observe(plan), self._loop.loop).result()
 
     def verdict(self, plan: Plan, *, stage: Stage = Stage.ACTIVE) -> Verdict:
         """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`."""
@@ -426,7 +424,7 @@ class Graph:
         """Look again at a node that says something else of itself than it answered, or reports."""
         name, after = change.node, change.after
         if after is not None and after.silent:
-            self._loop.bind().call_later(FORGET_AFTER_S, self.state.forget, after)
+            self._loop.loop.call_later(FORGET_AFTER_S, self.state.forget, after)
         if change.status_changed and name not in self.state.given:
             status = None if after is None else after.status
             if self._follows or not _says_as_before(status, self._answered.get(name)):
@@ -449,7 +447,7 @@ class Graph:
         if view is None or view.status is None or name in self.state.given:
             self._hide(name)
         else:
-            self._loop.bind().call_later(_FAREWELL_S, self._hide, name)
+            self._loop.loop.call_later(_FAREWELL_S, self._hide, name)
         self.clients.forget(name)
 
     def _hide(self, name: str) -> None:
@@ -459,7 +457,7 @@ class Graph:
     # -- nodes that are followed
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        task = self._loop.bind().create_task(work)
+        task = self._loop.loop.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -515,7 +513,7 @@ class Graph:
             self.state.learn(configuration)
         else:
             del self._read_as[name]
-            self._loop.bind().call_later(_AGAIN_S, self._wake)
+            self._loop.loop.call_later(_AGAIN_S, self._wake)
 
 
 def _judged_parameters(plan: Plan, present: Collection[str]) -> dict[str, Names]:

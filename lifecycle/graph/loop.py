@@ -18,18 +18,15 @@ class GraphLoop:
     """Runs what it is given in one asyncio loop, in order.
 
     Args:
-        own_thread: the loop has a thread of its own; else it is the one in which `bind` is first
-            called, and what is posted before waits for that.
+        loop: None has one in a thread of its own.
     """
 
-    def __init__(self, *, own_thread: bool) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop | None = None) -> None:
+        self.loop = loop or asyncio.new_event_loop()
         self._lock = threading.Lock()
-        self._early: list[Callable[[], object]] = []
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._closed = False
-        if own_thread:
-            self._loop = asyncio.new_event_loop()
+        if loop is None:
             self._thread = threading.Thread(target=self._run, name="graph", daemon=True)
             self._thread.start()
 
@@ -38,51 +35,32 @@ class GraphLoop:
         """Whether the loop has a thread of its own."""
         return self._thread is not None
 
-    def bind(self) -> asyncio.AbstractEventLoop:
-        """Return the loop.
-
-        Raises:
-            RuntimeError: there is none yet, and none runs here.
-        """
-        if self._loop is None:
-            loop = asyncio.get_running_loop()
-            with self._lock:
-                self._loop, early = loop, self._early
-            for work in early:
-                loop.call_soon(work)
-        return self._loop
-
     def post(self, work: Callable[[], object]) -> None:
         """Run `work` in the loop soon; from any thread. Dropped once the loop is closed."""
-        with self._lock:
-            if self._loop is None:
-                self._early.append(work)
-                return
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(work)
+            self.loop.call_soon_threadsafe(work)
 
     def close(self) -> None:
         """End the thread, if there is one, and cancel what runs in it; again is harmless."""
-        if self._thread is None or self._loop is None:
+        if self._thread is None:
             return
         with self._lock:
             closed, self._closed = self._closed, True
         if not closed:
-            self._loop.call_soon_threadsafe(self._loop.stop)
+            self.loop.call_soon_threadsafe(self.loop.stop)
         if self._thread is not threading.current_thread():
             self._thread.join()
 
     def _run(self) -> None:
-        assert self._loop is not None
         try:
-            self._loop.run_forever()
-            tasks = asyncio.all_tasks(self._loop)
+            self.loop.run_forever()
+            tasks = asyncio.all_tasks(self.loop)
             for each in tasks:
                 each.cancel()
             if tasks:
-                self._loop.run_until_complete(asyncio.wait(tasks))
+                self.loop.run_until_complete(asyncio.wait(tasks))
         finally:
-            self._loop.close()
+            self.loop.close()
 
 
 async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:

@@ -143,10 +143,8 @@ def hidden_nodes() -> tuple[Node, ...]:
     return tuple(node for node in _hidden if node.context.ok())
 
 
-Action: typing.TypeAlias = Waitable
-"""An action server or client; importing their classes takes 100 ms."""
-
-MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Action
+MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Waitable
+"""A Waitable is an action server or client; importing their classes takes 100 ms."""
 
 _KINDS = {Subscription: "subscription", Service: "service", Client: "client"}
 """What rclpy's methods and lists of a node are called after."""

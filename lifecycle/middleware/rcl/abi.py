@@ -15,6 +15,8 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: F401 - loads rcl
+
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, private, rcl_version
 
@@ -298,20 +300,15 @@ def bind(symbol: str, result: Any, arguments: tuple[Any, ...]) -> Any:
     Raises:
         MiddlewareError: there is none.
     """
-    # Importing rclpy loads the very same libraries; dlopen then finds them by name wherever they
-    # are installed, and never a second copy.
+    # rclpy has loaded the very same libraries: dlopen finds them by name wherever they are
+    # installed, and never a second copy.
+    library = symbol.partition("_")[0]
     try:
-        from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: F401
-    except ImportError as error:
-        raise MiddlewareError(f"cannot import rclpy: {error}", hint=INSTALL) from error
-    try:
-        library = symbol.partition("_")[0]
         function = getattr(ctypes.CDLL(f"lib{library}.so"), symbol)
-    except OSError as error:
-        raise MiddlewareError(f"cannot load 'lib{library}.so': {error}", hint=INSTALL) from error
-    except AttributeError as error:
+    except (OSError, AttributeError) as error:
         raise MiddlewareError(
-            f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'})",
+            f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'}): "
+            f"{error}",
             hint=INSTALL,
         ) from error
     function.restype, function.argtypes = result, arguments

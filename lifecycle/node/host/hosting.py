@@ -45,11 +45,7 @@ from lifecycle.verify.observation import NodeConfiguration
 
 def process_context(spec: HostSpec) -> Context:
     """Initialise rclpy for a process and return its default context."""
-    try:
-        settings = ParticipantSettings.of(spec.nodes[0])
-    except LifecycleError:  # reported where the node is made
-        settings = ParticipantSettings()
-    return initialised(settings, spec.domain_id)
+    return initialised(ParticipantSettings.of(spec.nodes[0]), spec.domain_id)
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(

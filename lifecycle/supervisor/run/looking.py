@@ -123,8 +123,7 @@ def judge_running(
                 return _judged(plan, observation, participant, unanswered=unanswered)
             await _change(participant, min(left_s, _ASK_AGAIN_S))
 
-    with _looking(plan) as participant:
-        return asyncio.run(judge(participant))
+    return asyncio.run(_with_participant(plan, judge))
 
 
 def with_supervisors_numbers(seen: JudgedSystem) -> JudgedSystem:
@@ -183,8 +182,7 @@ def follow_running(
                 changed = await _change(participant, min(pause_s, left_s))
                 pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
 
-    with _looking(plan) as participant:
-        asyncio.run(follow(participant))
+    asyncio.run(_with_participant(plan, follow))
 
 
 def _apart_from_numbers(seen: JudgedSystem) -> JudgedSystem:
@@ -201,6 +199,11 @@ def _enter_domain(domain_id: int, discovery_range: DiscoveryRange) -> None:
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
     check_memory()
+
+
+async def _with_participant(plan: Plan, look: Callable[[ObserverParticipant], Awaitable[T]]) -> T:
+    with _looking(plan) as participant:
+        return await look(participant)
 
 
 def _looking(plan: Plan) -> ObserverParticipant:
@@ -376,10 +379,12 @@ def capture_running(
 
     environment = dict(os.environ)
     _enter_domain(domain_id, discovery_range)
-    with Graph.in_loop(domain_id) as graph:
-        observation, parameters, unsettled, programs = asyncio.run(
-            _look(graph, wait_s, None if attach else environment)
-        )
+
+    async def look() -> tuple[Observation, _Parameters, str, Programs]:
+        with Graph.in_loop(domain_id) as graph:
+            return await _look(graph, wait_s, None if attach else environment)
+
+    observation, parameters, unsettled, programs = asyncio.run(look())
     return capture(
         observation,
         parameters,

@@ -13,13 +13,13 @@ LIMIT_S = 5.0
 
 
 def test_a_thread_of_its_own_runs_what_is_posted_and_ends_with_its_coroutines() -> None:
-    loop, done = GraphLoop(own_thread=True), threading.Event()
+    loop, done = GraphLoop(), threading.Event()
     ran: list[str] = []
     loop.post(lambda: ran.append(threading.current_thread().name))
     loop.post(done.set)
     assert done.wait(LIMIT_S)
     assert (ran, loop.has_thread) == (["graph"], True)
-    waiting = asyncio.run_coroutine_threadsafe(asyncio.sleep(3600), loop.bind())
+    waiting = asyncio.run_coroutine_threadsafe(asyncio.sleep(3600), loop.loop)
     loop.post(loop.close)  # from inside
     loop.close()
     loop.close()
@@ -28,20 +28,19 @@ def test_a_thread_of_its_own_runs_what_is_posted_and_ends_with_its_coroutines() 
     loop.post(lambda: pytest.fail("the loop is closed"))
 
 
-def test_a_loop_that_is_there_runs_what_was_posted_before_and_drops_what_comes_too_late() -> None:
-    loop = GraphLoop(own_thread=False)
+def test_a_loop_that_is_there_runs_what_is_posted_and_drops_what_comes_too_late() -> None:
     ran: list[str] = []
-    loop.post(lambda: ran.append("early"))
 
-    async def use() -> None:
-        assert loop.bind() is asyncio.get_running_loop()
-        thread = threading.Thread(target=lambda: loop.post(lambda: ran.append("late")))
+    async def use() -> GraphLoop:
+        loop = GraphLoop(asyncio.get_running_loop())
+        thread = threading.Thread(target=lambda: loop.post(lambda: ran.append("posted")))
         thread.start()
         thread.join()
         await asyncio.sleep(0.01)
+        return loop
 
-    asyncio.run(use())
-    assert (ran, loop.has_thread) == (["early", "late"], False)
+    loop = asyncio.run(use())
+    assert (ran, loop.has_thread) == (["posted"], False)
     loop.post(lambda: pytest.fail("the loop is closed"))
     loop.close()
 

@@ -144,6 +144,9 @@ def plan(*names: str) -> Plan:
     return plan_of(*(planned_node(name, kind=RunKind.ATTACH) for name in names))
 
 
+LOOP = asyncio.new_event_loop()
+
+
 @pytest.fixture
 def graph() -> FakeGraph:
     return FakeGraph()
@@ -156,7 +159,11 @@ def clients() -> FakeClients:
 
 def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Graph:
     """An observer as a supervisor has it."""
-    return Graph(graph, clients, GraphLoop(own_thread=False), **options)
+    try:
+        loop = asyncio.get_running_loop()
+    except RuntimeError:
+        loop = LOOP
+    return Graph(graph, clients, GraphLoop(loop), **options)
 
 
 @pytest.fixture
@@ -168,7 +175,7 @@ def run(awaitable: Awaitable[T]) -> T:
     async def bounded() -> T:
         return await asyncio.wait_for(awaitable, 10)
 
-    return asyncio.run(bounded())
+    return LOOP.run_until_complete(bounded())
 
 
 def managed(*names: str) -> tuple[ObservedNode, ...]:
@@ -303,9 +310,9 @@ def test_a_look_uses_up_the_changes_before_it(observer: Graph, graph: FakeGraph)
     run(look_and_wait())
 
 
-def test_a_burst_is_waited_out_but_not_for_ever(observer: Graph, graph: FakeGraph) -> None:
+def test_a_burst_is_waited_out_but_not_for_ever(graph: FakeGraph, clients: FakeClients) -> None:
     async def burst() -> tuple[float, float]:
-        loop = asyncio.get_running_loop()
+        loop, observer = asyncio.get_running_loop(), observing(graph, clients)
         await observer.observe(plan())
 
         async def keep_changing() -> None:
@@ -353,7 +360,7 @@ def test_an_observation_waits_for_who_answered_and_is_not_seen_yet() -> None:
     graph = FakeGraph()
     graph.arriving = [(), (), (ObservedNode(full_name="/stranger"),)]
     observer = observing(graph, FakeClients())
-    observation = asyncio.run(observer.observe(plan()))
+    observation = run(observer.observe(plan()))
     assert [node.full_name for node in observation.nodes] == ["/stranger"]
 
 

@@ -37,8 +37,7 @@ class LoopOfItsOwn(GraphLoop):
 class World:
     def __init__(self, *, follows: bool = True) -> None:
         self.graph, self.clients = FakeGraph(), FakeClients()
-        loop = (LoopOfItsOwn if follows else GraphLoop)(own_thread=False)
-        loop.bind()
+        loop = (LoopOfItsOwn if follows else GraphLoop)(asyncio.get_running_loop())
         self.observer = Graph(self.graph, self.clients, loop)
         self.state = self.observer.state
 

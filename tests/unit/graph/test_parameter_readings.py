@@ -67,8 +67,7 @@ class Reader:
     def __init__(self) -> None:
         self.services = Services()
         self.woken = 0
-        loop = GraphLoop(own_thread=False)
-        loop.bind()
+        loop = GraphLoop(asyncio.get_running_loop())
         self.readings = ParameterReadings(self.services, loop, self._wake)
         self.readings.listen(NAMED)
 
