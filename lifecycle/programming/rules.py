@@ -24,9 +24,6 @@ from lifecycle.verify.network_flows import UNKNOWN
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
-PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
-"""The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""
-
 T = TypeVar("T")
 
 MAX_FLOW_LABEL = 0xFFFFF
