@@ -19,7 +19,7 @@ import functools
 import ipaddress
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import msgspec
@@ -28,8 +28,6 @@ from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.network.medium import SCHEMES, Medium, udp_to
 from lifecycle.network.nfe import is_wildcard
 
-_PORTS = range(1, 65536)
-_TTLS = range(256)
 _DISCOVERY_SERVER = re.compile(r"[0-9a-fA-F]{2}(\.[0-9a-fA-F]{2}){11}")
 
 
@@ -90,46 +88,37 @@ _UDP = frozenset(each for each in SCHEMES if each.is_udp)
 _IP = frozenset(each for each in SCHEMES if each.is_network)
 
 
-class Option(msgspec.Struct, frozen=True, kw_only=True):
-    """One option; `read` returns its value from its name and text."""
+class Option(NamedTuple):
+    """One option of a URL; `read` returns its value from its name and text.
+
+    It may stand several times where its attribute is a tuple.
+    """
 
     attribute: str
     read: Callable[[str, str], Any]
     transports: frozenset[Medium]
-    repeated: bool = False
-
-    def spell(self, value: Any) -> tuple[str, ...]:
-        """Return the texts of `value`."""
-        if self.read is _switch:
-            return ("on" if value else "off",)
-        return tuple(str(each) for each in (value if self.repeated else (value,)))
 
 
-_PORT = functools.partial(_number, _PORTS)
+_PORT = functools.partial(_number, range(1, 65536))
+_DATAGRAM = functools.partial(_number, range(500, 65501))
 OPTIONS = {
-    "metatraffic_port": Option(attribute="metatraffic_port", read=_PORT, transports=_UDP),
-    "output_port": Option(attribute="output_port", read=_PORT, transports=_UDP),
-    "peer": Option(attribute="peers", read=_peer, transports=_IP, repeated=True),
-    "multicast": Option(attribute="multicast", read=_switch, transports=_UDP),
-    "server": Option(attribute="server", read=_peer, transports=_IP, repeated=True),
-    "server_prefix": Option(attribute="server_prefix", read=_prefix, transports=_IP),
-    "ttl": Option(attribute="ttl", read=functools.partial(_number, _TTLS), transports=_UDP),
-    "interface": Option(
-        attribute="interfaces", read=lambda _, value: value, transports=_UDP, repeated=True
-    ),
-    "dscp": Option(attribute="dscp", read=functools.partial(_number, range(64)), transports=_UDP),
-    "max_datagram_bytes": Option(
-        attribute="max_datagram_bytes",
-        read=functools.partial(_number, range(500, 65501)),
-        transports=_UDP,
-    ),
-    "non_blocking_send": Option(attribute="non_blocking_send", read=_switch, transports=_UDP),
+    "metatraffic_port": Option("metatraffic_port", _PORT, _UDP),
+    "output_port": Option("output_port", _PORT, _UDP),
+    "peer": Option("peers", _peer, _IP),
+    "multicast": Option("multicast", _switch, _UDP),
+    "server": Option("server", _peer, _IP),
+    "server_prefix": Option("server_prefix", _prefix, _IP),
+    "ttl": Option("ttl", functools.partial(_number, range(256)), _UDP),
+    "interface": Option("interfaces", lambda _, value: value, _UDP),
+    "dscp": Option("dscp", functools.partial(_number, range(64)), _UDP),
+    "max_datagram_bytes": Option("max_datagram_bytes", _DATAGRAM, _UDP),
+    "non_blocking_send": Option("non_blocking_send", _switch, _UDP),
 }
 
 
 def _read_options(transport: Medium, query: str) -> dict[str, Any]:
     """Return the options after `?`, by attribute of ConnectionUrl."""
-    read: dict[str, Any] = {}
+    default, read = ConnectionUrl(transport=transport), dict[str, Any]()
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in OPTIONS:
             allowed = [each for each, how in OPTIONS.items() if transport in how.transports]
@@ -140,7 +129,7 @@ def _read_options(transport: Medium, query: str) -> dict[str, Any]:
         option = OPTIONS[name]
         if transport not in option.transports:
             raise ConnectionUrlError(f"{transport.value} has no option {name!r}")
-        if option.repeated:
+        if isinstance(getattr(default, option.attribute), tuple):
             before = read.get(option.attribute, ())
             read[option.attribute] = (*before, option.read(name, value))
         elif option.attribute in read:
@@ -195,10 +184,10 @@ class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
         own = Peer(address=self.address, port=self.port)
         default = ConnectionUrl(transport=self.transport)
         words = [
-            (name, text)
+            (name, ("off", "on")[each] if isinstance(each, bool) else str(each))
             for name, option in OPTIONS.items()
             if (value := getattr(self, option.attribute)) != getattr(default, option.attribute)
-            for text in option.spell(value)
+            for each in (value if isinstance(value, tuple) else (value,))
         ]
         query = urlencode(words, safe=":[]")
         return f"{self.transport.value}://{own}{'?' + query if query else ''}"

@@ -329,27 +329,14 @@ class TableTarget(Target):
         Raises:
             ProgrammingError: what is there is not ours, or may not be read.
         """
-        return self._brought(rules, write=False)
+        return self.apply(rules, write=False)
 
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Write it if anything differs.
+    def apply(self, rules: Sequence[FlowRule], *, write: bool = True) -> TargetChanges:
+        """Write it if anything differs, unless it is only to be compared.
 
         Raises:
             ProgrammingError: it could not be written; then nothing of ours is left.
         """
-        return self._brought(rules, write=True)
-
-    def remove(self) -> TargetChanges:
-        """Delete what the ledger says is there, if it still is."""
-        known = self._ledger.find(self._record)
-        if known is None:
-            return TargetChanges(target=self.name)
-        there = self.clear()
-        self._ledger.put(self._record)
-        gone = [FlowChange(kind=ChangeKind.DELETE, key=each.key) for each in known.entries]
-        return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
-
-    def _brought(self, rules: Sequence[FlowRule], *, write: bool) -> TargetChanges:
         placed, left_out = expressed(rules, self.lines)
         try:
             wanted = self.wanted(placed)
@@ -378,6 +365,16 @@ class TableTarget(Target):
         if write and done.pending:
             self._write_down(record, wanted, anew=anew)
         return done
+
+    def remove(self) -> TargetChanges:
+        """Delete what the ledger says is there, if it still is."""
+        known = self._ledger.find(self._record)
+        if known is None:
+            return TargetChanges(target=self.name)
+        there = self.clear()
+        self._ledger.put(self._record)
+        gone = [FlowChange(kind=ChangeKind.DELETE, key=each.key) for each in known.entries]
+        return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
 
     def _write_down(self, record: TargetRecord, wanted: Wanted, *, anew: bool) -> None:
         """Write it, and in the ledger before and after."""

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import quote, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
 import msgspec
 import yaml
@@ -481,11 +481,6 @@ class Api:
 
 def _asked(request: httpx.Request) -> str:
     return f"{request.method} {request.url}"
-
-
-def as_segment(identifier: str) -> str:
-    """Return an id as one path segment."""
-    return quote(identifier, safe="")
 
 
 def text_of(value: object, secret: str = "") -> str:

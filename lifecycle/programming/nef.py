@@ -15,7 +15,7 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from lifecycle.programming import http
-from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
+from lifecycle.programming.rules import FlowRule
 from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
 
 if TYPE_CHECKING:
@@ -26,7 +26,8 @@ _FIXED = ("ueIpv4Addr", "ueIpv6Addr")
 
 _COMPARED = (*_FIXED, "qosReference", "notificationDestination", "flowInfo")
 
-_PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
+_PROTOCOLS = {"udp": "17", "tcp": "6"}
+"""IANA Assigned Internet Protocol Numbers."""
 
 
 class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,9 +61,7 @@ class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown
     @property
     def scope(self) -> str:
         """Our collection of subscriptions, without the last path segment."""
-        return (
-            f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{http.as_segment(self.scs_as_id)}"
-        )
+        return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{self.scs_as_id}"
 
 
 def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:

@@ -70,20 +70,20 @@ class NftTarget(host.TableTarget):
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare, and warn where marks change nothing."""
         planned = super().plan(rules)
-        return replace(planned, warnings=self._warnings() if planned.pending else ())
-
-    def _warnings(self) -> tuple[str, ...]:
+        if not planned.pending:
+            return planned
         try:
             found = host.qdiscs(self._tool, doing="list queueing disciplines")
         except ProgrammingError:
-            return ()
-        return tuple(
+            return planned
+        warnings = tuple(
             f"marking alone gives no priority on {each.dev}: its queueing discipline {each.kind} "
             f"{_WITHOUT_PRIORITY[each.kind]}; add one that looks at these flows: "
             f"lifecycle flows apply MANIFEST --target tc --device {each.dev} --rate RATE"
             for each in found
             if each.root and each.dev != "lo" and each.kind in _WITHOUT_PRIORITY
         )
+        return replace(planned, warnings=warnings)
 
 
 TARGET = NftTarget

@@ -15,29 +15,14 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.network import nfe
 from lifecycle.network.dscp import describe
 from lifecycle.network.five_qi import DscpMapping
 from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import (
-    FlowTuple,
-    InternetProtocol,
-    IpAddress,
-    TransportProtocol,
-    canonical,
-    is_ip,
-    is_loopback,
-    is_multicast,
-    is_wildcard,
-    parse_address,
-    socket_text,
-)
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.network_flows import UNKNOWN
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
-
-PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
-"""The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""
 
 T = TypeVar("T")
 
@@ -77,7 +62,7 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
 
     key: str
     names: tuple[tuple[str, str, str], ...]
-    transport_protocol: TransportProtocol
+    transport_protocol: nfe.TransportProtocol
     source_address: str
     source_port: int
     destination_address: str
@@ -97,15 +82,19 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
                 f"cannot filter packets from {self.source_address} to {self.destination_address}: "
                 f"one is IPv{of}, the other IPv{to}; use two addresses of one family"
             )
-        if self.flow_label and self.internet_protocol is InternetProtocol.IPV4:
+        if self.flow_label and self.internet_protocol is nfe.InternetProtocol.IPV4:
             raise ValueError(
                 f"cannot set flow label {self.flow_label:#x} on IPv4: only IPv6 has one (RFC 6437)"
             )
 
     @property
-    def internet_protocol(self) -> InternetProtocol:
+    def internet_protocol(self) -> nfe.InternetProtocol:
         """The family, which the destination decides."""
-        return InternetProtocol.IPV6 if ":" in self.destination_address else InternetProtocol.IPV4
+        return (
+            nfe.InternetProtocol.IPV6
+            if ":" in self.destination_address
+            else nfe.InternetProtocol.IPV4
+        )
 
     def left_out(self, reason: str) -> list[str]:
         """Return each pair that this one flow carries as one that is left out."""
@@ -113,8 +102,8 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
 
     def describe(self) -> str:
         """Return the tuple for people: `udp 10.77.0.1:17900 → 10.77.0.2:17910`."""
-        source = socket_text(self.source_address or "*", self.source_port)
-        destination = socket_text(self.destination_address, self.destination_port)
+        source = nfe.socket_text(self.source_address or "*", self.source_port)
+        destination = nfe.socket_text(self.destination_address, self.destination_port)
         return f"{self.transport_protocol.value} {source} → {destination}"
 
     @property
@@ -135,13 +124,13 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         return ", ".join(found) or "nothing"
 
 
-def _address(text: str) -> IpAddress:
+def _address(text: str) -> nfe.IpAddress:
     """Return the address that `text` spells.
 
     Raises:
         ValueError: not one unicast address: a name, a zone, a wildcard or a group.
     """
-    address = parse_address(text)
+    address = nfe.parse_address(text)
     # A zone means something on its own host only.
     if address is None or "%" in text or address.is_unspecified or address.is_multicast:
         raise ValueError(
@@ -236,7 +225,7 @@ def _rules_of(
     if report.effective_transport in _UNSEEN:
         return leave_out(_UNSEEN[report.effective_transport])
     unknown = report.effective_transport == UNKNOWN
-    if unknown and not all(map(is_ip, (*report.source, *report.destination))):
+    if unknown and not all(map(nfe.is_ip, (*report.source, *report.destination))):
         leave_out(_UNSEEN[Medium.SHM])
     if not report.tuples and not unknown:
         leave_out("its two ends have no IP transport in common")
@@ -253,10 +242,10 @@ def _rules_of(
             address.partition("%")[0] for address in (each.source_address, each.destination_address)
         )
         flow = replace(each, source_address=sender, destination_address=to)
-        if is_multicast(to):
+        if nfe.is_multicast(to):
             leave_out(f"group {to}: no unicast 5-tuple")
             continue
-        if is_loopback(to) and remote:
+        if nfe.is_loopback(to) and remote:
             leave_out("loopback: never leaves the subscription's machine")
             continue
         try:
@@ -278,21 +267,21 @@ def _rules_of(
 
 
 def _source(
-    flow: FlowTuple,
+    flow: nfe.FlowTuple,
     plan: Plan,
     publisher: PlannedNode | None,
     subscription: PlannedNode | None,
     observe: SourceAddress | None,
 ) -> str:
     """The address that the flow's packets come from; empty if it is not known."""
-    if not is_wildcard(flow.source_address):
+    if not nfe.is_wildcard(flow.source_address):
         return flow.source_address
     if publisher is None:
         return ""
-    v6 = flow.internet_protocol is InternetProtocol.IPV6
+    v6 = flow.internet_protocol is nfe.InternetProtocol.IPV6
     if observe is not None and (seen := observe(publisher, flow.destination_address)):
-        return canonical(seen) if (":" in seen) is v6 else ""
-    declared = {each.name: canonical(each.address) for each in plan.machines if each.address}
+        return nfe.canonical(seen) if (":" in seen) is v6 else ""
+    declared = {each.name: nfe.canonical(each.address) for each in plan.machines if each.address}
     address = declared.get(publisher.machine, "")
     other = "" if subscription is None else declared.get(subscription.machine, "")
     if address and other == flow.destination_address and (":" in address) is v6:
@@ -322,7 +311,7 @@ def _merged(sharing: Sequence[FlowRule]) -> FlowRule:
 
 def _treated(rule: FlowRule, treatment: Treatment) -> FlowRule:
     """The rule with what follows from its 5QI and its 5-tuple."""
-    mapping, is_ipv6 = treatment.mapping, rule.internet_protocol is InternetProtocol.IPV6
+    mapping, is_ipv6 = treatment.mapping, rule.internet_protocol is nfe.InternetProtocol.IPV6
     if mapping is not None and rule.dscp is None and rule.five_qi is not None:
         rule = replace(rule, dscp=mapping.dscp_for(rule.five_qi))
     if treatment.label_flows and is_ipv6 and not rule.flow_label:

@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
+from urllib.parse import quote
 
 import msgspec
 from msgspec import to_builtins
@@ -21,14 +22,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
-from lifecycle.programming.http import (
-    Api,
-    IpNetwork,
-    ServerSettings,
-    as_segment,
-    load_settings,
-    text_of,
-)
+from lifecycle.programming.http import Api, IpNetwork, ServerSettings, load_settings, text_of
 from lifecycle.programming.ledger import Entry, TargetRecord
 from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
@@ -255,7 +249,7 @@ class ServerTarget(Target):
 
     def path(self, id_: str) -> str:
         """Return the path of one thing."""
-        return f"{self.collection}/{as_segment(id_)}"
+        return f"{self.collection}/{quote(id_, safe='')}"
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""

@@ -71,12 +71,15 @@ def command(
     4 if no node is there.
     """
     from lifecycle.cli.verbs.init import schema_reference
-    from lifecycle.export.manifest_yaml import to_manifest
+    from lifecycle.export.manifest_yaml import SUFFIX, to_manifest, to_nodl
     from lifecycle.manifest.model import Discovery
     from lifecycle.plan.build import effective_domain, effective_range
     from lifecycle.supervisor.run.looking import capture_running
 
-    _check_name(system)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", system):
+        raise UsageError(
+            f"cannot name a system {system!r}; use letters, digits, '_' and '-', a letter first"
+        )
     discovery = Discovery(domain_id=domain)
     captured = capture_running(
         system=system,
@@ -97,8 +100,14 @@ def command(
         )
         _say_gaps(captured)
         return ExitCode.VIOLATED
-    references = {} if nodl_dir is None else _write_nodl(captured, nodl_dir, output)
-    schema = schema_reference(Path.cwd() if output is None else output.parent)
+    base = Path.cwd() if output is None else output.parent
+    references = {}
+    if nodl_dir is not None:
+        for node in captured.nodes:
+            path = nodl_dir / f"{node.key}{SUFFIX}"
+            write_text(path, to_nodl(node))
+            references[node.key] = f"local://{os.path.relpath(path, base)}"
+    schema = schema_reference(base)
     text = to_manifest(captured, references=references, schema=schema)
     if output is None:
         click.echo(text, nl=False)
@@ -111,23 +120,3 @@ def command(
 def _say_gaps(captured: CapturedSystem) -> None:
     for gap in captured.gaps:
         say(one_line(f"gap: {gap}"))
-
-
-def _check_name(system: str) -> None:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", system):
-        raise UsageError(
-            f"cannot name a system {system!r}; use letters, digits, '_' and '-', a letter first"
-        )
-
-
-def _write_nodl(captured: CapturedSystem, folder: Path, output: Path | None) -> dict[str, str]:
-    """Write a document for each node; return what the manifest calls them, relative to itself."""
-    from lifecycle.export.manifest_yaml import SUFFIX, to_nodl
-
-    base = Path.cwd() if output is None else output.parent
-    references = {}
-    for node in captured.nodes:
-        path = folder / f"{node.key}{SUFFIX}"
-        write_text(path, to_nodl(node))
-        references[node.key] = f"local://{os.path.relpath(path, base)}"
-    return references

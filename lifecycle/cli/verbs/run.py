@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import NoReturn
 
 import click
 
@@ -18,7 +17,6 @@ from lifecycle.middleware.fastdds.discovery import peers_environment
 from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
 from lifecycle.plan.build import find_node
 from lifecycle.plan.discovery import reached_hosts
-from lifecycle.plan.model import Plan, PlannedNode
 
 _ROS_ARGUMENTS = "--ros-args"
 
@@ -68,39 +66,28 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
         limit_resources(planned.run.limits.resources())
     if planned.run.no_new_privileges:
         refuse_new_privileges()
+    beside = str(Path(planned.at.file).absolute().parent)
+    if planned.run.working_directory:
+        os.chdir(planned.run.working_directory)
     if planned.run.kind is RunKind.COMMAND:
-        _replace_process(plan, planned, words[split:])
-    return _run_class(plan, planned, list(words[split:]), lifecycle="auto" if auto else "manual")
-
-
-def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
+        process = next(each for each in plan.processes if each.name == planned.process)
+        os.environ.update(dict(process.environment))
+        argv = [*process.argv, *words[split:]]
+        try:
+            os.execvp(argv[0], argv)  # noqa: S606 - the manifest's own command
+        except OSError as error:
+            raise UsageError(f"cannot run {argv[0]!r}: {error.strerror}") from error
     # Late: everything before this works without ROS, and says what is wrong without it.
     from lifecycle.node.host.standalone import run
     from lifecycle.node.planned import load_nodes
     from lifecycle.supervisor.processes.logs import check_log_root
 
     check_log_root(os.environ)
-
-    beside = str(Path(planned.at.file).absolute().parent)
-    if planned.run.working_directory:
-        os.chdir(planned.run.working_directory)
     run(
         load_nodes(planned.run.python, (beside,)),
-        lifecycle=lifecycle,
+        lifecycle="auto" if auto else "manual",
         spec=planned,
         domain_id=plan.domain_id,
-        arguments=arguments,
+        arguments=list(words[split:]),
         interrupted=ExitCode.INTERRUPTED,
     )
-
-
-def _replace_process(plan: Plan, planned: PlannedNode, arguments: tuple[str, ...]) -> NoReturn:
-    process = next(each for each in plan.processes if each.name == planned.process)
-    if planned.run.working_directory:
-        os.chdir(planned.run.working_directory)
-    os.environ.update(dict(process.environment))
-    argv = [*process.argv, *arguments]
-    try:
-        os.execvp(argv[0], argv)  # noqa: S606 - the manifest's own command
-    except OSError as error:
-        raise UsageError(f"cannot run {argv[0]!r}: {error.strerror}") from error

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.target import Chosen
-    from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult
 
 
@@ -104,6 +102,7 @@ def command(
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
     """
+    from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
     from lifecycle.supervisor.run.signals import Ended, Ending
 
     is_program = bool(click.get_current_context().obj)
@@ -115,8 +114,12 @@ def command(
             ending.unmasked(),
         ):
             program, treatment = common.read_networks(targets, rest, option="--program")
+            # Secrets of networks, which nothing that is started shall have.
+            tokens = (each.target.token_variables(each.settings) for each in program)
             # It imports while we do and read the manifest.
-            process = _fork_server(program)
+            process = ForkServerProcess(
+                without=frozenset[str]().union(*tokens), programs=bool(program)
+            )
             try:
                 plan = common.load_plan(manifest, assignments, machine=machine, domain_id=domain)
                 if without:
@@ -162,17 +165,6 @@ def command(
     except Ended as ended:
         common.say(f"ended before anything was started: {ended.reason}")
         return ended.exit_code
-
-
-def _fork_server(program: tuple[Chosen, ...]) -> ForkServerProcess:
-    from lifecycle.supervisor.processes.fork_server_main import ForkServerProcess
-
-    tokens: frozenset[str] = frozenset()
-    if program:  # their secrets, which nothing that is started shall have
-        tokens = frozenset().union(
-            *(each.target.token_variables(each.settings) for each in program)
-        )
-    return ForkServerProcess(without=tokens, programs=bool(program))
 
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:
