@@ -175,17 +175,16 @@ def _node(node: PlannedNode) -> _Tree:
 
 
 def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
-    spelled = ("kind", "environment", "working_directory", "arguments", "executor")
-    plain = _fields(node.run, *spelled, "extra_arguments")
-    run = {name: value for name, value in plain.items() if value} or {node.run.kind.value: True}
-    if node.run.kind is RunKind.PYTHON:
-        run["arguments"] = _plain(node.run.arguments)
-        run["executor"] = node.run.executor.value
-    if node.run.extra_arguments:
-        run["extra_arguments"] = _plain(node.run.extra_arguments)
-    run["working_directory"] = folder.written if folder else node.run.working_directory or None
-    run["environment"] = dict(node.run.environment)
-    return run
+    run = node.run
+    return {
+        **{name: each for name, each in _fields(run, "kind").items() if each},
+        **{name: _plain(getattr(run, name)) for name in _OF_RUN if getattr(run, name)},
+        "working_directory": folder.written if folder else run.working_directory or None,
+    }
+
+
+_OF_RUN = ("arguments", "environment", "extra_arguments")
+"""Fields of `run` that are pairs of a name and a value."""
 
 
 def _plain(values: Iterable[tuple[str, object]]) -> _Tree:
@@ -199,7 +198,7 @@ def _consequences(said: OnViolation) -> _Tree:
 def _interface(node: PlannedNode) -> _Tree:
     found: dict[str, dict[str, object]] = {"parameters": {}}
     for parameter in node.declared_parameters:
-        declared = _fields(parameter, "name", "description", "at")
+        declared = _fields(parameter, "name", "description")
         declared["default_value"] = declared.pop("default")
         found["parameters"][parameter.name] = declared
     for each in node.endpoints:
@@ -247,8 +246,8 @@ _NOT_ASKED = {each.name: each.default for each in msgspec.structs.fields(Planned
 
 
 def _fields(value: object, *without: str) -> dict[str, object]:
-    """Return the fields of a Struct by name."""
-    plain = to_plain(value)
+    """Return the fields of a Struct by name, without where it is written."""
+    plain = _without_positions(to_plain(value))
     assert isinstance(plain, dict)
     return {name: each for name, each in plain.items() if name not in without}
 

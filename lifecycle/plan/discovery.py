@@ -29,7 +29,6 @@ from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.network.medium import (
     DEFAULT_TCP,
     LOOPBACK,
-    LOOPBACK6,
     RMW_DEFAULT,
     RMW_DISCOVERY,
     UDP_UNICAST,
@@ -244,12 +243,11 @@ class Observers(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         connections: as they are on the control plane.
-        ports: given out to each where it needs them: metatraffic, user data and source port of UDP,
-            and a listening port of TCP.
+        with_tcp: as they are if they must also be found by TCP.
     """
 
     connections: Mapping[str, ParticipantConnections]
-    ports: Mapping[str, tuple[int, ...]]
+    with_tcp: Mapping[str, ParticipantConnections]
 
 
 _Slot = tuple[str, str, str]
@@ -293,10 +291,17 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
         server = PlannedServer(
             machine=hosts.server, address=at or LOOPBACK, port=pool.take(at)[0], tcp=tcp
         )
+    # Of an observer: for metatraffic, user data and sending of UDP, and to listen at by TCP.
     ports = {host: pool.take(host, 4) for host in hosts.used}
+
+    def observers(connections: Mapping[str, ParticipantConnections]) -> Observers:
+        with_tcp = {
+            host: _with_tcp(each, host, ports[host][3], hosts) for host, each in connections.items()
+        }
+        return Observers(connections=connections, with_tcp=with_tcp)
+
     if transport is FlowTransport.ANY:
-        none = dict.fromkeys(hosts.used, ParticipantConnections())
-        return plan, Observers(connections=none, ports=ports)
+        return plan, observers(dict.fromkeys(hosts.used, ParticipantConnections()))
     (kind,) = transport.media
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and kind.is_network
     extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
@@ -341,10 +346,8 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
         else node
         for node in plan.nodes
     )
-    connections = {host: connected(("observer", host, "")) for host in hosts.used}
-    return replace(plan, nodes=nodes, server=server), Observers(
-        connections=connections, ports=ports
-    )
+    found = observers({host: connected(("observer", host, "")) for host in hosts.used})
+    return replace(plan, nodes=nodes, server=server), found
 
 
 _Key = TypeVar("_Key")
@@ -364,8 +367,9 @@ def meshed(
         server: by which they find each other; None: each looks for all others.
     """
     # Of several hosts each has an address (check.discovery-address).
-    loopback = LOOPBACK6 if kind.ip_version == 6 else LOOPBACK
-    alone = {key: fixed_url(kind, host or loopback, taken) for key, (host, taken) in ports.items()}
+    alone = {
+        key: fixed_url(kind, host or kind.loopback, taken) for key, (host, taken) in ports.items()
+    }
     if server is not None:
         at = (Peer(address=server.address, port=server.port),)
         return {key: str(replace(url, server=at, multicast=True)) for key, url in alone.items()}
@@ -377,14 +381,6 @@ def meshed(
         later = [] if kind.is_tcp else contacts[index + 1 :]
         found[key] = str(replace(url, peers=tuple(sorted([*contacts[:index], *later]))))
     return found
-
-
-def with_tcp(observers: Observers, hosts: Hosts) -> dict[str, ParticipantConnections]:
-    """Return the observers as they are if they must also be found by TCP, by host."""
-    return {
-        host: replace(each, urls=tuple(map(str, _with_tcp(each, observers, host, hosts))))
-        for host, each in observers.connections.items()
-    }
 
 
 def connect_observers(
@@ -409,7 +405,7 @@ def connect_observers(
     # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
         contact.peer
-        for host, each in with_tcp(observers, hosts).items()
+        for host, each in observers.with_tcp.items()
         for contact in contacts_of(host, each.urls)
     }
     contacts = [
@@ -425,7 +421,7 @@ def connect_observers(
         found = _base_urls(base)
         needed = kinds - {url.transport.unicast for url in found if url.transport.is_network}
         if any(each.is_tcp for each in needed):
-            found = _with_tcp(base, observers, host, hosts)
+            found = [parse(text) for text in observers.with_tcp[host].urls]
         found += [ConnectionUrl(transport=kind) for kind in UDP_UNICAST if kind in needed]
         new = [{*peers_by(url.transport, wanted, host=host)} - {*url.peers} for url in found]
         if not needed and not any(new):
@@ -452,12 +448,11 @@ def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
 
 
 def _with_tcp(
-    base: ParticipantConnections, observers: Observers, host: str, hosts: Hosts
-) -> list[ConnectionUrl]:
+    base: ParticipantConnections, host: str, port: int, hosts: Hosts
+) -> ParticipantConnections:
     urls = _base_urls(base)
-    if any(each.transport.is_tcp for each in urls):
-        return urls
-    # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
-    address = LOOPBACK if ":" in host or not (host or hosts.several) else host
-    port = observers.ports[host][3]
-    return [*urls, ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port)]
+    if not any(each.transport.is_tcp for each in urls):
+        # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
+        address = LOOPBACK if ":" in host or not (host or hosts.several) else host
+        urls.append(ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port))
+    return replace(base, urls=tuple(map(str, urls)))

@@ -168,7 +168,7 @@ class Sources:
             NotThereError: there is no such module, or no such class in it.
             UnknownError: that cannot be decided.
         """
-        found = self._named(self._module(module), name, 0)
+        found = self._named(f"{module}.{name}")
         if isinstance(found, str):
             kind = next((each for each in _NODES if each.value == found), ClassKind.UNKNOWN)
             return NodeClass(name=name, file="", kind=kind)
@@ -257,7 +257,7 @@ class Sources:
             above: list[Definition] = []
             for base in each.node.bases:
                 try:
-                    named = self._followed(_dotted(each.module, base), 0)
+                    named = self._named(_dotted(each.module, base))
                 except (NotThereError, UnknownError) as problem:
                     unknown = unknown or f"its base {ast.unparse(base)} is not known: {problem}"
                     continue
@@ -268,16 +268,22 @@ class Sources:
             left = above + left
         return tuple(found), known, unknown
 
-    def _named(self, module: _Module, name: str, depth: int) -> Definition | str:
-        """Return what a name at the top of a module stands for; text for what need not be read.
+    def _named(self, dotted: str, depth: int = 0) -> Definition | str:
+        """Return what a full name stands for, through imports; text for what need not be read.
 
         Raises:
-            NotThereError: nothing in the module is called so.
+            NotThereError: nothing in its module is called so.
             UnknownError: that cannot be decided.
         """
+        if known := _known(dotted):
+            return known
+        place, _, name = dotted.rpartition(".")
+        if not place or depth > _MOST_IMPORTS:
+            raise UnknownError("it has to be evaluated")
+        module = self._module(place)
         only = module.only(name)
         if isinstance(only, ast.ImportFrom):
-            return self._followed(_dotted(module, ast.Name(name)), depth + 1)
+            return self._named(_dotted(module, ast.Name(name)), depth + 1)
         if isinstance(only, ast.ClassDef) or (
             isinstance(only, Function) and not only.decorator_list
         ):
@@ -297,15 +303,6 @@ class Sources:
             f"cannot find class {name!r} in {module.name} ({file}){has}",
             hint=did_you_mean(name, classes),
         )
-
-    def _followed(self, dotted: str, depth: int) -> Definition | str:
-        """Return what a full name stands for, as `_named` does."""
-        if known := _known(dotted):
-            return known
-        module, _, name = dotted.rpartition(".")
-        if not module or depth > _MOST_IMPORTS:
-            raise UnknownError("it has to be evaluated")
-        return self._named(self._module(module), name, depth)
 
     def _module(self, name: str) -> _Module:
         if name not in self._modules:

@@ -39,7 +39,6 @@ from lifecycle.plan.discovery import (
     connect_control,
     connect_observers,
     meshed,
-    with_tcp,
 )
 from lifecycle.plan.media import (
     DataLayerGraph,
@@ -298,7 +297,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        observers=_by_machine(with_tcp(own, hosts), hosts),
+        observers=_by_machine(own.with_tcp, hosts),
     )
     variables = dict(variables_of(plan))
     parties = {

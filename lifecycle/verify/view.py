@@ -24,6 +24,7 @@ from lifecycle.plan.model import (
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
+    PlannedParticipant,
 )
 from lifecycle.verify.network_flows import Uniqueness
 from lifecycle.verify.observation import (
@@ -282,18 +283,19 @@ def may_hide(node: PlannedNode, endpoint: PlannedEndpoint) -> bool:
     alone, or on a host or group that the observer is not part of; and with static endpoint
     discovery it announces no endpoint at all.
     """
-    for each in node.participants:
-        if each.name == endpoint.participant:
-            return bool(each.connections.urls or each.connections.static_participants)
-    return bool(node.connections.urls or node.connections.static_participants)
+    on = _participant_of(node, endpoint)
+    connections = node.connections if on is None else on.connections
+    return bool(connections.urls or connections.static_participants)
 
 
 def connection_of(node: PlannedNode, endpoint: PlannedEndpoint) -> str:
     """Return the name of the connection that an endpoint is planned on; empty for none."""
-    for each in node.participants:
-        if each.name == endpoint.participant:
-            return each.connection
-    return ""
+    on = _participant_of(node, endpoint)
+    return "" if on is None else on.connection
+
+
+def _participant_of(node: PlannedNode, endpoint: PlannedEndpoint) -> PlannedParticipant | None:
+    return next((each for each in node.participants if each.name == endpoint.participant), None)
 
 
 def actual_qos(observed: QosProfile | None, reported: QosProfile | None) -> QosProfile | None:

@@ -202,9 +202,7 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
 
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
-    types: dict[tuple[str, str], dict[str, None]] = {}  # in plan order
-    for actual in view.actual:
-        types.setdefault((actual.kind.meets_in, actual.name), {})[actual.planned.type] = None
+    types = {(each.kind.meets_in, each.name): each.planned.type for each in view.actual}
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared = (
         *(each for each in view.seen if each.planned is None),
@@ -212,16 +210,16 @@ def _conflicts(view: View) -> Iterator[Finding]:
     )
     for seen in undeclared:
         what = seen.kind.meets_in
-        declared = types.get((what, seen.name))
-        if declared is None or seen.type in declared:
+        declared = types.get((what, seen.name), seen.type)
+        if seen.type == declared:
             continue
         yield TYPE_MISMATCH.finding(
             subject=seen.name,
-            expected=" or ".join(declared),
+            expected=declared,
             observed=seen.type or "no type",
             message=f"{seen.where} matches none: it is"
             f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
-            f" {' or '.join(declared)}",
+            f" {declared}",
             node=seen.node,
             endpoint=seen.kind,
         )

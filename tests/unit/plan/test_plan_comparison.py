@@ -169,6 +169,16 @@ def test_two_hosts_with_one_manifest_plan_the_same_wherever_they_keep_it(tmp_pat
     assert plan_checksum(here) == plan_checksum(there)
 
 
+def test_limits_that_are_written_elsewhere_are_the_same(tmp_path: Path):
+    text = MANIFEST.replace("working_directory: work", "resources: {memory_max_mib: 64}")
+    here = plan_of(tmp_path / "here", text)
+    there = plan_of(tmp_path / "there", "\n\n" + text)
+    assert differences(here, there) == ()
+    assert plan_checksum(here) == plan_checksum(there)
+    less = plan_of(tmp_path / "less", text.replace("64", "32"))
+    assert differences(here, less) == ("nodes.talker.run.resources.memory_max_mib: was 64, is 32",)
+
+
 def test_the_checksum_does_not_depend_on_which_types_are_installed(tmp_path: Path):
     here = plan_of(tmp_path / "here")
     unknown = replace(
