@@ -43,7 +43,6 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.core.state import Order
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 
@@ -108,8 +107,6 @@ class ControlServer:
         )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        from lifecycle.supervisor.core.state import Order  # clients do not need it
-
         self._open.add(writer)
         try:
             while line := await reader.readline():
@@ -136,8 +133,8 @@ class ControlServer:
 
     async def _answer(self, question: Order) -> Answer:
         if question.ask is ControlRequest.STATUS:
-            plan = question.plan
-            differs = () if plan is None else self._session.differences(plan)
+            running, plan = self._session.system.first, question.plan
+            differs = () if plan is None else difference_lines(changes(running, plan))
             return Answer(status=self._session.status(), differences=differs)
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())

@@ -330,8 +330,20 @@ async def adopt(
         system.emit(Notice(message=f"what runs may not be all that is adopted: {unsettled}"))
     count = {each.full_name: each.count for each in nodes}
     found = {key: node for key, node in system.nodes.items() if node.name in count}
-    if twice := [each for each in found.values() if count[each.name] > 1]:
-        return system.plan, tuple(_runs_twice(each, count[each.name]) for each in twice)
+    twice = tuple(
+        DUPLICATE_NODE.on(
+            each.planned,
+            outcome=Outcome.VIOLATED,
+            expected="1 node of this name",
+            observed=f"{number} nodes",
+            message=f"cannot adopt {each.name}: {number} nodes are named so",
+            hint="end all but one of them: nothing was started, and nothing asked of them",
+        )
+        for each in found.values()
+        if (number := count[each.name]) > 1
+    )
+    if twice:
+        return system.plan, twice
     for process in system.run.processes.values():
         missing = [key for key in process.planned.nodes if key not in found]
         if 0 < len(missing) < len(process.planned.nodes):
@@ -346,17 +358,6 @@ async def adopt(
     processes = participant.processes()
     system.adopted = {each.name: _where(processes.get(each.name, {})) for each in found.values()}
     return attached_to(system.plan, found), ()
-
-
-def _runs_twice(node: NodeRun, count: int) -> Finding:
-    return DUPLICATE_NODE.on(
-        node.planned,
-        outcome=Outcome.VIOLATED,
-        expected="1 node of this name",
-        observed=f"{count} nodes",
-        message=f"cannot adopt {node.name}: {count} nodes are named so",
-        hint="end all but one of them: nothing was started, and nothing asked of them",
-    )
 
 
 def _where(processes: Mapping[int, str]) -> str:

@@ -432,7 +432,11 @@ class Peers:
         for notice in self._known:
             if notice.checksum == ours:
                 continue
-            who = _who(notice, self._system.plan.system)
+            machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
+            of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
+            if notice.system != self._system.plan.system:
+                of = f"system {notice.system[:80]!r} on {of}"
+            who = f"the supervisor of {of}"
             theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
                 subject=who,
@@ -485,11 +489,3 @@ def _forget(peer: _Peer) -> None:
     if peer.watch is not None:
         peer.watch.destroy()
         peer.watch = None
-
-
-def _who(notice: PlanNotice, system: str) -> str:
-    machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
-    of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
-    if notice.system == system:
-        return f"the supervisor of {of}"
-    return f"the supervisor of system {notice.system[:80]!r} on {of}"

@@ -19,7 +19,6 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.graph.loop import ended
-from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
@@ -170,10 +169,6 @@ class Supervisor:
     def stop(self, reason: str, exit_code: ExitCode) -> None:
         """Ask the run to end; once it ends, an interrupt asks it to hurry."""
         self.give(messages.Stop(reason=reason, code=exit_code))
-
-    def differences(self, plan: Plan) -> tuple[str, ...]:
-        """Say how `plan` differs from what runs, one line each; empty if it does not."""
-        return difference_lines(changes(self.system.first, plan))
 
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
@@ -516,7 +511,7 @@ class Supervisor:
 
     async def _leave_nothing(self) -> None:
         """Undo what is no process's: after the last message has left, and before strays end."""
-        await asyncio.gather(*self._processes.releasing)
+        await asyncio.gather(*self._processes.ends)
         await ended(*filter(None, (self._programming,)))
         if self._closing is not None:
             await asyncio.wait({self._closing})
