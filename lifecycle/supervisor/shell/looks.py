@@ -328,34 +328,28 @@ class Looks:
         """Look at nodes of others, and at ours that others may drive, while no verdict is made."""
         while True:
             changed = self._shell.changed
-            asked, looks = self._followed()
+            asked = self._followed()
             system, run = self._system, self._system.run
             is_looked_at = run.judged.looking or run.is_watched or advance.is_at_gate(run)
-            if looks and not is_looked_at:
+            if (asked or system.plan.awaited) and not is_looked_at:
                 began = dict(system.processes)
                 seen = await self._graph.observe(system.plan, only=asked, machines=system.machines)
                 self._saw(seen, began)
             remote = any(run.elsewhere.values())
             await set_within(changed, REMOTE_S if remote else None)
 
-    def _followed(self) -> tuple[frozenset[str], bool]:
-        """Return the names of the nodes that are asked, and whether it is to be looked at all."""
+    def _followed(self) -> frozenset[str]:
+        """Return the names of the nodes that are asked."""
         run, ready = self._system.run, self._system.plan.awaited
-        awaited = {after.node for each in run.nodes.values() for after in each.planned.after}
-        healthy = {
-            after.node
-            for each in run.nodes.values()
-            for after in each.planned.after
-            if after.condition is Condition.HEALTHY
-        }
-        keys = {key for key in run.elsewhere if key in awaited}
+        afters = [after for each in run.nodes.values() for after in each.planned.after]
+        healthy = {each.node for each in afters if each.condition is Condition.HEALTHY}
+        keys = {each.node for each in afters if each.node in run.elsewhere}
         for key, node in self._system.nodes.items():
             foreign = node.planned.managed and not node.is_hosted
             reads = any(not each.by.kinds for each in ready.get(key, ()))
             if foreign or reads or (key in healthy and not node.reports_health):
                 keys.add(key)
-        names = frozenset(each.full_name for each in run.plan.nodes if each.key in keys)
-        return names, bool(names or ready)
+        return frozenset(each.full_name for each in run.plan.nodes if each.key in keys)
 
     def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:
         """Say what is seen of nodes that do not report to us, where that is new.

@@ -108,6 +108,7 @@ class Processes:
         names = {each.pid: each.name for each in self._system.living}
         try:
             directory.record({**names, self._means.fork_server.pid: FORK_SERVER})
+            self._is_recorded = True
         except OSError as error:
             if self._is_recorded:
                 text = (
@@ -117,8 +118,6 @@ class Processes:
                 )
                 self._system.emit(Notice(message=text))
             self._is_recorded = False
-        else:
-            self._is_recorded = True
 
     def _apart(self, process: ManagedProcess) -> tuple[str, ...]:
         """Return the topics whose messages come by the clock of another host."""
@@ -136,11 +135,10 @@ class Processes:
 
     async def _say_end(self, process: ManagedProcess) -> None:
         """Say how a process ended; of one that was starting, once all is read that it said."""
-        known = self._system.run.processes.get(process.name)
-        is_starting = known is not None and known.state is ProcessState.STARTING
-        if process.channel is not None and is_starting:
-            await process.channel.drained(_WORDS_S)
         system, channel = self._system, process.channel
+        known = system.run.processes.get(process.name)
+        if channel is not None and known is not None and known.state is ProcessState.STARTING:
+            await channel.drained(_WORDS_S)
         end = process.ended.result()
         carried = system.carried_by(process.name)
         self.forget(process.pid, carried)

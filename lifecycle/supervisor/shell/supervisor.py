@@ -44,7 +44,6 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     Notice,
     ProcessChanged,
-    StepFailedError,
     Stopped,
 )
 from lifecycle.supervisor.run.options import UpResult
@@ -52,7 +51,6 @@ from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
-from lifecycle.verify.judge import with_findings
 from lifecycle.verify.rules.catalogue import PROCESS_DIED
 from lifecycle.verify.verdict import NOT_JUDGED, Verdict
 
@@ -414,16 +412,7 @@ class Supervisor:
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started."""
-        try:
-            plan, findings = await adopt(self.system, self.means.participant)
-        except StepFailedError as failed:
-            self.give(messages.Broken(failure=failed.failure))
-            return
-        if findings:
-            verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
-            self.give(messages.Refused(verdict=verdict))
-        else:
-            self.give(messages.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
+        self.give(await adopt(self.system, self.means.participant))
 
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
