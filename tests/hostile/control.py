@@ -15,7 +15,7 @@ from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest.loading import load
 from lifecycle.plan.build import build_plan
 from lifecycle.run_directory import connect
-from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, ask
+from lifecycle.supervisor.control.protocol import ControlRequest, Question, ask
 from tests.hostile.attack import (
     Attack,
     Attacks,
@@ -50,7 +50,7 @@ class Running:
 
     def check(self) -> None:
         """Whoever asks properly is answered at once, whatever others sent before."""
-        answer = ask(self.run / "control", Question(ask=ControlRequest.STATUS), WAIT_S, Answer)
+        answer = ask(self.run / "control", Question(ask=ControlRequest.STATUS), WAIT_S)
         if answer is None or answer.status is None:
             raise Unhandled(f"no status any more: {answer}; {self.up.events[-2:]}")
 
@@ -129,7 +129,7 @@ def _other_plan(change: str, verb: str, system: Running) -> None:
 
 def _ordered(node: str, system: Running) -> None:
     question = Question(ask=ControlRequest.RESTART, node=node)
-    answer = ask(system.run / "control", question, 10.0, Answer)
+    answer = ask(system.run / "control", question, 10.0)
     if answer is None or answer.exit_code in {None, 0, 70} or not answer.error:
         raise Unhandled(f"restart of {node!r}: {answer}")
     system.check()

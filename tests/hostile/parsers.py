@@ -31,7 +31,7 @@ from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.target import Means, ProgrammingError
 from lifecycle.run_directory import read_record
-from lifecycle.supervisor.control.server import LookAnswer
+from lifecycle.supervisor.control.protocol import Answer
 from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
@@ -163,8 +163,8 @@ READERS: dict[str, Reader] = {
         errors=(ValueError,),
     ),
     "control answer": Reader(
-        good=to_json(LookAnswer(exit_code=0, error="x", differences=("a",))),
-        read=lambda data, _: from_json(data, LookAnswer),
+        good=to_json(Answer(exit_code=0, error="x", differences=("a",))),
+        read=lambda data, _: from_json(data, Answer),
         errors=(ValueError,),
     ),
     "host event": Reader(

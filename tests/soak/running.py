@@ -22,7 +22,6 @@ from rclpy.executors import SingleThreadedExecutor
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (
-    Answer,
     ControlRequest,
     Question,
     SystemStatus,
@@ -94,7 +93,7 @@ class Watched(Up):
         """Ask over the control socket; None if nobody answers."""
         for path in (self.runtime / "lifecycle").glob(f"{NAME}@*/control"):
             with contextlib.suppress(OSError):
-                answer = ask(path, Question(ask=ControlRequest.STATUS), BOUND_S, Answer)
+                answer = ask(path, Question(ask=ControlRequest.STATUS), BOUND_S)
                 if answer is not None:
                     return answer.status
         return None

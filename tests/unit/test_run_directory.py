@@ -33,7 +33,6 @@ from lifecycle.run_directory import (
 )
 from lifecycle.supervisor.control import protocol
 from lifecycle.supervisor.control.protocol import (
-    Answer,
     ControlRequest,
     Question,
     SystemStatus,
@@ -264,12 +263,12 @@ def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(
         await server.open()
         loop = asyncio.get_running_loop()
         answer = await loop.run_in_executor(
-            None, ask, deep / "control", Question(ask=ControlRequest.STATUS), 5.0, Answer
+            None, ask, deep / "control", Question(ask=ControlRequest.STATUS), 5.0
         )
         assert answer is not None
         assert answer.status == STATUS
         down = loop.run_in_executor(
-            None, ask, deep / "control", Question(ask=ControlRequest.DOWN), 5.0, Answer
+            None, ask, deep / "control", Question(ask=ControlRequest.DOWN), 5.0
         )
         await asyncio.wait_for(asked.wait(), 5.0)
         await server.close(0)
@@ -362,7 +361,7 @@ def test_an_answer_that_never_ends_is_not_waited_for(
     with _Stranger(tmp_path, b"[", 0.02):
         path = tmp_path / "pair@7" / "control"
         with pytest.raises(TimeoutError):
-            ask(path, Question(ask=ControlRequest.STATUS), 0.3, Answer)
+            ask(path, Question(ask=ControlRequest.STATUS), 0.3)
         with pytest.raises(TimeoutError):
             next(follow(path))
 

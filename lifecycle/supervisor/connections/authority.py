@@ -259,7 +259,8 @@ class ConnectionAuthority:
         elif wiring.rounds >= TRIES:
             wiring.given_up = said.checksum
             return False
-        due_s = wiring.last_s + _backoff_s(wiring.rounds)
+        pause_s = min(AGAIN_AT_MOST_S, AGAIN_S * 2 ** (wiring.rounds - 1))
+        due_s = wiring.last_s + (pause_s if wiring.rounds else 0.0)
         if now_s < due_s:
             self.again_s = min(self.again_s, due_s - now_s)
         return now_s >= due_s
@@ -324,7 +325,3 @@ def _done(step: Command, *, attempt: int = 1, error: str = "") -> WiringChanged:
         attempt=max(1, attempt),
         error=error,
     )
-
-
-def _backoff_s(rounds: int) -> float:
-    return 0.0 if rounds == 0 else min(AGAIN_AT_MOST_S, AGAIN_S * 2 ** (rounds - 1))

@@ -14,7 +14,7 @@ import signal
 import socket
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -247,6 +247,8 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
         error: why an order was not carried out; empty if it was.
         differences: for STATUS with a plan, how that differs from what runs, one line each.
         change: for APPLY, what it is about.
+        look: for LOOK, and for FOLLOW at once and after each change, a SupervisorSnapshot: what
+            reads it knows its type, see server.py.
     """
 
     status: SystemStatus | None = None
@@ -254,13 +256,11 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
     differences: tuple[str, ...] = ()
     change: ChangedNodes | None = None
+    look: msgspec.Raw = msgspec.Raw(b"null")
 
 
-A = TypeVar("A", bound=Answer)
-
-
-def ask(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A | None:
-    """Ask the supervisor that listens at `path` what is answered as `type_`.
+def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
+    """Ask the supervisor that listens at `path`.
 
     Returns:
         Its answer; None if it ended without one.
@@ -273,12 +273,12 @@ def ask(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A |
     deadline = time.monotonic() + timeout_s
     with connect(path, timeout_s) as sock:
         sock.sendall(to_json(question) + b"\n")
-        return read_answer(path, sock, bytearray(), deadline, type_)
+        return read_answer(path, sock, bytearray(), deadline)
 
 
 def read_answer(
-    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None, type_: type[A]
-) -> A | None:
+    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None
+) -> Answer | None:
     """Read one answer, bounded in time and size; None if there is none any more.
 
     Args:
@@ -286,7 +286,6 @@ def read_answer(
         sock: connected to it.
         rest: what was read beyond the answer before.
         deadline_s: monotonic; None to wait for ever until one begins, and not long for its end.
-        type_: of the answer.
     """
     searched = 0
     while (end := rest.find(b"\n", searched)) < 0:
@@ -306,7 +305,7 @@ def read_answer(
     line = bytes(rest[:end])
     del rest[: end + 1]
     try:
-        return from_json(line, type_)
+        return from_json(line, Answer)
     except ValueError as error:
         raise strange(path, str(error)) from error
 
@@ -331,7 +330,7 @@ def status(path: Path) -> SystemStatus:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _answered(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
+    answer = _answered(path, Question(ask=ControlRequest.STATUS), STATUS_S)
     if answer.status is None:
         raise strange(path / _SOCKET, "it has no status")
     return answer.status
@@ -344,12 +343,9 @@ def look(path: Path) -> SupervisorSnapshot:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    from lifecycle.supervisor.control.server import LookAnswer  # its types are a whole plan's
+    from lifecycle.supervisor.control.server import shown  # its types are a whole plan's
 
-    answer = _answered(path, Question(ask=ControlRequest.LOOK), STATUS_S, LookAnswer)
-    if answer.look is None:
-        raise strange(path / _SOCKET, "it shows nothing")
-    return answer.look
+    return shown(path / _SOCKET, _answered(path, Question(ask=ControlRequest.LOOK), STATUS_S))
 
 
 def differences(path: Path, plan: Plan) -> tuple[str, ...]:
@@ -360,7 +356,7 @@ def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     """
     question = Question(ask=ControlRequest.STATUS, plan=plan)
     try:
-        answer = _asked(path, question, STATUS_S, Answer)
+        answer = _asked(path, question, STATUS_S)
     except TimeoutError:
         return ()
     return () if answer is None else answer.differences
@@ -381,7 +377,7 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
     _rouse(path)
-    answer = _answered(path, question, timeout_s, Answer)
+    answer = _answered(path, question, timeout_s)
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
         why = "it has no exit code" if code is None else f"its exit code is {code}"
@@ -389,16 +385,16 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
     return answer
 
 
-def _answered(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A:
-    if (answer := _asked(path, question, timeout_s, type_)) is None:
+def _answered(path: Path, question: Question, timeout_s: float) -> Answer:
+    if (answer := _asked(path, question, timeout_s)) is None:
         raise lost(path)
     return answer
 
 
-def _asked(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A | None:
+def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
     """Return the answer of a supervisor; None if it is not there any more."""
     try:
-        return ask(path / _SOCKET, question, timeout_s, type_)
+        return ask(path / _SOCKET, question, timeout_s)
     except (FileNotFoundError, ConnectionError):
         return None
 
@@ -406,7 +402,7 @@ def _asked(path: Path, question: Question, timeout_s: float, type_: type[A]) -> 
 def _rouse(path: Path) -> None:
     """Raise UsageError where a supervisor listens and does not answer: it was stopped, say."""
     try:
-        _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
+        _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S)
     except TimeoutError as error:
         raise silent(path) from error
 
@@ -428,7 +424,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     question, left_s = Question(ask=ControlRequest.DOWN), timeout_s
     answer: Answer | None = None
     while True:
-        answer = answer or _asked(path, question, left_s, Answer)
+        answer = answer or _asked(path, question, left_s)
         if answer is not None and answer.exit_code is None:
             raise strange(path / _SOCKET, "it has no exit code")
         if not is_held(path):

@@ -206,7 +206,6 @@ def diagnostics(
         _of_node(
             each,
             status,
-            (label, source),
             Outcome.worst(
                 finding.outcome
                 for finding in findings
@@ -218,7 +217,7 @@ def diagnostics(
     measured = {each.pair: each for each in status.measured if each.bounds}
     reported.flows |= measured.keys()
     entries += (
-        _of_flow(each, measured.get(each.pair), status, (label, source))
+        _of_flow(each, measured.get(each.pair), status)
         for each in (() if verdict is None else verdict.flows)
         if each.pair in reported.flows
     )
@@ -226,46 +225,38 @@ def diagnostics(
     for rule in sorted(reported.rules):
         found = [each for each in findings if each.rule == rule]
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        entries.append(
-            (
-                _LEVELS[Outcome.worst(each.outcome for each in found)],
-                f"{label}: {rule}",
-                f"{found[0].message}{more}" if found else "ok",
-                source,
-                tuple((each.subject, each.observed) for each in found),
-            )
-        )
-    return tuple(entries)
+        level = _LEVELS[Outcome.worst(each.outcome for each in found)]
+        message = f"{found[0].message}{more}" if found else "ok"
+        entries.append((level, rule, message, [(each.subject, each.observed) for each in found]))
+    return tuple(
+        (level, f"{label}: {name}", message, source, tuple(values))
+        for level, name, message, values in entries
+    )
 
 
 _DONE = ("measuring", "active")
 _LEVELS = {Outcome.OK: OK, Outcome.UNVERIFIABLE: WARN, Outcome.VIOLATED: ERROR}
+_Said = tuple[int, str, str, Sequence[tuple[str, str]]]
+"""Level, name, message and values."""
 
 
-def _of_flow(
-    flow: FlowReport,
-    measured: FlowMeasurement | None,
-    status: SystemStatus,
-    label: tuple[str, str],
-) -> Entry:
-    name = f"{label[0]}: {flow.topic} {flow.publisher} → {flow.subscription}"
+def _of_flow(flow: FlowReport, measured: FlowMeasurement | None, status: SystemStatus) -> _Said:
+    name = f"{flow.topic} {flow.publisher} → {flow.subscription}"
     if measured is None:
         level, message = _LEVELS[flow.outcome], "not measured"
         if level == OK and status.phase not in _DONE:
             level, message = WARN, f"{message}, the system is {status.phase}"
-        return level, name, message, label[1], ()
+        return level, name, message, ()
     # Numbers are values, so that who shows each new message is not shown one each second.
     message = measured.outcome
     level = {"violated": ERROR, "unverifiable": WARN}.get(message, OK)
     if measured.violated:
         message += f": {', '.join(dict.fromkeys(each.name for each in measured.violated))}"
     bounds = ((each.name, each.text) for each in measured.bounds)
-    return level, name, message, label[1], (*measured.numbers().items(), *bounds)
+    return level, name, message, (*measured.numbers().items(), *bounds)
 
 
-def _of_node(
-    node: NodeStatus, status: SystemStatus, label: tuple[str, str], outcome: Outcome
-) -> Entry:
+def _of_node(node: NodeStatus, status: SystemStatus, outcome: Outcome) -> _Said:
     level, message = _LEVELS[outcome], node.state or node.reach.value
     message += f", {node.doing}" if node.doing else ""
     if node.next_try_s is not None:
@@ -291,4 +282,4 @@ def _of_node(
         values += [("cpu_s", f"{node.cpu_s:.2f}"), ("rss_bytes", str(node.rss_bytes))]
     if node.last_failure is not None:
         values.append(("last_failure", f"{node.last_failure.at}: {node.last_failure.message}"))
-    return level, f"{label[0]}: {node.node}", message, label[1], tuple(values)
+    return level, node.node, message, values

@@ -33,6 +33,7 @@ from lifecycle.supervisor.control.protocol import (
     Question,
     SystemStatus,
     read_answer,
+    strange,
 )
 from lifecycle.supervisor.core.change import change_to
 from lifecycle.supervisor.core.orders import SAID, restarted
@@ -43,7 +44,6 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.core.state import Order
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 
@@ -66,16 +66,6 @@ class SupervisorSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     status: SystemStatus
     observation: Observation
     verdict: Verdict | None
-
-
-class LookAnswer(Answer, frozen=True, kw_only=True):
-    """Answer to LOOK and FOLLOW.
-
-    Attributes:
-        look: for FOLLOW one at once and one after each change.
-    """
-
-    look: SupervisorSnapshot | None = None
 
 
 class ControlServer:
@@ -108,8 +98,6 @@ class ControlServer:
         )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        from lifecycle.supervisor.core.state import Order  # clients do not need it
-
         self._open.add(writer)
         try:
             while line := await reader.readline():
@@ -136,12 +124,16 @@ class ControlServer:
 
     async def _answer(self, question: Order) -> Answer:
         if question.ask is ControlRequest.STATUS:
-            plan = question.plan
-            differs = () if plan is None else self._session.differences(plan)
+            differs: tuple[str, ...] = ()
+            if (plan := question.plan) is not None:
+                differs = difference_lines(changes(self._session.system.first, plan))
             return Answer(status=self._session.status(), differences=differs)
         if question.ask is ControlRequest.LOOK:
-            return LookAnswer(look=self._session.look())
+            return self._looks()
         return await self._session.order(question)
+
+    def _looks(self) -> Answer:
+        return Answer(look=msgspec.Raw(to_json(self._session.look())))
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Send what is known now and after each change, until the client goes away."""
@@ -149,7 +141,7 @@ class ControlServer:
         try:
             while not gone.done():
                 changed = self._changed
-                await _say(writer, LookAnswer(look=self._session.look()))
+                await _say(writer, self._looks())
                 waiting = asyncio.ensure_future(changed.wait())
                 await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()
@@ -196,9 +188,20 @@ def follow(path: Path) -> Iterator[SupervisorSnapshot]:
     with connect(path, ANSWER_S) as sock:
         sock.sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
         rest = bytearray()
-        while (answer := read_answer(path, sock, rest, None, LookAnswer)) is not None:
-            if answer.look is not None:
-                yield answer.look
+        while (answer := read_answer(path, sock, rest, None)) is not None:
+            yield shown(path, answer)
+
+
+def shown(path: Path, answer: Answer) -> SupervisorSnapshot:
+    """Return what a supervisor shows in an answer.
+
+    Raises:
+        UsageError: it is none of this version.
+    """
+    try:
+        return from_json(answer.look, SupervisorSnapshot)
+    except ValueError as error:
+        raise strange(path, str(error)) from error
 
 
 _CHANGEABLE = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
@@ -255,7 +258,28 @@ def _check_apply(plan: Plan, system: System) -> None:
     change = change_to(system.run, plan)
     # Whoever has other ports by that has other connections, too, and is started again.
     found = tuple(each for each in change.differences if each.path != "order of nodes")
-    _check_surroundings(plan, running, found, what)
+    fixed = [
+        each
+        for each in found
+        if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
+    ]
+    places = (
+        ("ROS_DOMAIN_ID", running.domain_id, plan.domain_id),
+        (
+            "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            running.discovery_range.name,
+            plan.discovery_range.name,
+        ),
+        ("RMW_IMPLEMENTATION", running.rmw, plan.rmw),
+    )
+    lines = [*difference_lines(fixed)]
+    if not any(each.path.startswith("discovery.") for each in found):
+        # Two plans that declare the same may have been made in environments that differ.
+        lines += (f"{name}: was {old}, is {new}" for name, old, new in places if old != new)
+    if lines:
+        raise _refused_whole(what, "a running supervisor cannot change this:", lines)
+    if (running.observers, running.server) != (plan.observers, plan.server):
+        raise _refused_whole(what, "its supervisor would be connected otherwise")
     if system.remote or len(local_processes(plan, machine)) < len(plan.processes):
         raise _refused_whole(
             what, "nodes on other machines run by it, too:", difference_lines(found)
@@ -271,25 +295,6 @@ def _check_apply(plan: Plan, system: System) -> None:
                 f"{what}: {name!r} would be taken down, and was adopted",
                 hint="who started it ends it; then lifecycle down, and lifecycle up",
             )
-
-
-def _check_surroundings(
-    plan: Plan, running: Plan, found: tuple[PlanDifference, ...], what: str
-) -> None:
-    """Make sure that another plan is for the same supervisor, in the same surroundings."""
-    elsewhere = any(each.path.startswith("discovery.") for each in found)
-    fixed = [
-        *difference_lines(
-            each
-            for each in found
-            if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
-        ),
-        *(() if elsewhere else _places(running, plan)),
-    ]
-    if fixed:
-        raise _refused_whole(what, "a running supervisor cannot change this:", fixed)
-    if (running.observers, running.server) != (plan.observers, plan.server):
-        raise _refused_whole(what, "its supervisor would be connected otherwise")
 
 
 def _is_whole(plan: Plan) -> bool:
@@ -313,21 +318,6 @@ def _refused_whole(what: str, why: str, lines: Iterable[str] = ()) -> UsageError
         f"{what}: {why}{listed}",
         hint="end it and start it anew: lifecycle down, then lifecycle up",
     )
-
-
-def _places(running: Plan, plan: Plan) -> Iterator[str]:
-    """Yield how the environments differ in which two plans were made that declare the same."""
-    for what, old, new in (
-        ("ROS_DOMAIN_ID", running.domain_id, plan.domain_id),
-        (
-            "ROS_AUTOMATIC_DISCOVERY_RANGE",
-            running.discovery_range.name,
-            plan.discovery_range.name,
-        ),
-        ("RMW_IMPLEMENTATION", running.rmw, plan.rmw),
-    ):
-        if old != new:
-            yield f"{what}: was {old}, is {new}"
 
 
 def _urls(plan: Plan) -> Iterator[str]:

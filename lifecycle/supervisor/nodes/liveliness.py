@@ -92,44 +92,32 @@ class SilenceMonitor:
         silence = self._silent.get(node)
         return silence is not None and bool({Cause.STOPPED, Cause.LOST} & silence.causes.keys())
 
-    def fell_silent(
-        self, nodes: Iterable[str], cause: Cause, detail: str, *, busy_s: float = 0.0
-    ) -> None:
-        """Note that nodes are silent; `detail` is half a sentence.
+    def note(self, nodes: Iterable[str], cause: Cause, why: str, *, busy_s: float = 0.0) -> None:
+        """Note why nodes are silent, half a sentence; empty once that cause of it is gone.
 
-        A callback of theirs has been running for `busy_s` if they hang.
+        A node without another cause is alive then. A callback of theirs has been running for
+        `busy_s` if they hang.
         """
-        news = False
+        now_s, is_news = self._emit.elapsed_s, False
         for name in nodes:
             silence = self._silent.get(name)
+            if bool(why) is (silence is not None and cause in silence.causes):
+                continue
+            is_news = True
             if silence is None:
-                silence = self._silent[name] = _Silence(self._emit.elapsed_s, {cause: detail})
-                self._emit(NodeSilent(node=name, cause=cause.value, message=_message(name, detail)))
-                news = True
-            elif cause not in silence.causes:
-                silence.causes[cause] = detail
-                news = True
-            else:
+                silence = self._silent[name] = _Silence(now_s, {cause: why})
+                self._emit(NodeSilent(node=name, cause=cause.value, message=_message(name, why)))
+            if why:
+                silence.causes[cause] = why
+                if cause is Cause.HUNG:
+                    silence.hangs_since_s = now_s - busy_s
                 continue
-            if cause is Cause.HUNG:
-                silence.hangs_since_s = self._emit.elapsed_s - busy_s
-        if news:
-            self._tell()
-
-    def came_back(self, nodes: Iterable[str], cause: Cause) -> None:
-        """Note that a cause is gone; a node without another one is alive."""
-        news = False
-        for name in nodes:
-            silence = self._silent.get(name)
-            if silence is None or silence.causes.pop(cause, None) is None:
-                continue
-            news = True
+            del silence.causes[cause]
             if not silence.causes:
                 del self._silent[name]
-                silent_s = self._emit.elapsed_s - silence.since_s
-                there = self._is_there(name)
+                silent_s, there = now_s - silence.since_s, self._is_there(name)
                 self._emit(NodeAlive(node=name, silent_s=silent_s, there=there))
-        if news:
+        if is_news:
             self._tell()
 
     def unanswered(self, node: str, after_s: float) -> None:
@@ -167,14 +155,13 @@ class SilenceMonitor:
         names = tuple(nodes)
 
         def stopped(is_stopped: bool) -> None:
-            if is_stopped:
-                detail = f"its process {process.name!r} (pid {process.pid}) was stopped by a signal"
-                self.fell_silent(names, Cause.STOPPED, detail)
-            else:
-                self.came_back(names, Cause.STOPPED)
+            why = f"its process {process.name!r} (pid {process.pid}) was stopped by a signal"
+            self.note(names, Cause.STOPPED, why if is_stopped else "")
 
         def hung(why: Overdue | None) -> None:
             where = f"its process {process.name!r} (pid {process.pid})"
+            hangs = unserved = ""
+            busy_s = 0.0
             if why is Overdue.HANGS:
                 assert process.channel is not None
                 assert process.channel.sign is not None
@@ -182,18 +169,16 @@ class SilenceMonitor:
                 limit_s, busy_s = sign.limit_s, sign.busy_s
                 what = f" {sign.what}" if sign.what else ""
                 at = process.where()
-                detail = (
+                hangs = (
                     f"a callback{what} in {where} has been running for more than {limit_s:g} s"
                     f"{at and f', in {at}'}"
                 )
-                self.fell_silent(names, Cause.HUNG, detail, busy_s=busy_s)
             elif why is Overdue.UNSERVED:
-                detail = f"{where} gets no processor for its callback: the machine is overloaded"
-                self.fell_silent(names, Cause.UNSERVED, detail)
-            if why is not Overdue.HANGS:
-                self.came_back(names, Cause.HUNG)
-            if why is not Overdue.UNSERVED:
-                self.came_back(names, Cause.UNSERVED)
+                unserved = f"{where} gets no processor for its callback: the machine is overloaded"
+            if unserved:  # they are silent all the while, if for another reason
+                self.note(names, Cause.UNSERVED, unserved)
+            self.note(names, Cause.HUNG, hangs, busy_s=busy_s)
+            self.note(names, Cause.UNSERVED, unserved)
 
         process.on_stop = stopped
         process.ended.add_done_callback(lambda _: self.forget(names))

@@ -7,18 +7,16 @@ in this room it is imported late, where a participant is made.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import rclpy
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.graph import Graph
-from lifecycle.graph.loop import set_within
 from lifecycle.middleware.fastdds.factory import unknown_versions
 from lifecycle.middleware.fastdds.participant import republish_names
 from lifecycle.middleware.fastdds.sockets import (
@@ -148,42 +146,29 @@ class ObserverParticipant:
 _SETTLED_S = 0.5
 """Discovery has settled once nothing changed for so long and everything has a node."""
 
+_LOOK_S = 0.05
+
 Snapshot = tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]
 
 
 async def settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
     """Wait until the graph changes no more; return it, and what it still lacked in the end."""
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + wait_s
-    changed = asyncio.Event()
-
-    def wake() -> None:
-        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-            loop.call_soon_threadsafe(changed.set)
-
-    remove = graph.on_change(wake)
-    try:
-        while True:
-            changed.clear()
-            snapshot = graph.snapshot()
-            pending = _pending(snapshot, settling_s=graph.settling.left_s())
-            left_s = deadline - loop.time()
-            if left_s <= 0:
-                what = ", ".join(pending) or "it still changed"
-                return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
-            stirred = await set_within(changed, min(_SETTLED_S, left_s))
-            if not stirred and not pending and left_s >= _SETTLED_S:
-                return snapshot, ""
-    finally:
-        remove()
-
-
-def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
-    """Say what discovery still has to show."""
-    _, endpoints = snapshot
-    pending = dict.fromkeys(
-        f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
-    )
-    if settling_s > 0:
-        pending["a participant whose node is not known"] = None
-    return tuple(pending)
+    clock = asyncio.get_running_loop().time
+    snapshot, since_s = graph.snapshot(), clock()
+    deadline_s = since_s + wait_s
+    while True:
+        lacking = dict.fromkeys(
+            f"nobody tells whose {each.name} is"
+            for each in snapshot[1]
+            if not known_node(each.node)
+        )
+        if graph.settling.left_s() > 0:
+            lacking["a participant whose node is not known"] = None
+        if not lacking and clock() - since_s >= _SETTLED_S:
+            return snapshot, ""
+        if clock() >= deadline_s:
+            what = ", ".join(lacking) or "it still changed"
+            return snapshot, f"discovery had not settled after {wait_s:g} s: {what}"
+        await asyncio.sleep(_LOOK_S)
+        if (found := graph.snapshot()) != snapshot:
+            snapshot, since_s = found, clock()

@@ -126,7 +126,6 @@ class Peers:
         self._judged_marks: tuple[ArrivedMark, ...] = ()
         self._said: PlanNotice | None = None
         self._known: list[PlanNotice] = []
-        self._again: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
         """Begin to watch, and announce ourselves and our plan where another supervisor may be."""
@@ -159,7 +158,7 @@ class Peers:
             peer = self._attached.pop(name)
             _forget(peer)
             for cause in (Cause.LOST, Cause.REPORTED):
-                self._system.liveliness.came_back(peer.nodes, cause)
+                self._system.liveliness.note(peer.nodes, cause, "")
         for name in names:
             if name not in self._attached:
                 peer = self._watch(node_alive_topic(name), repr(name), "", [name])
@@ -182,9 +181,8 @@ class Peers:
 
     async def close(self) -> None:
         """Announce, watch and compare no more."""
-        for timer in (self._again, self._exchanging):
-            if timer is not None:
-                timer.cancel()
+        if self._exchanging is not None:
+            self._exchanging.cancel()
         if self._notices is not None:
             self._notices.destroy()
             self._notices = None
@@ -227,34 +225,22 @@ class Peers:
     def _alive(self, peer: _Peer, is_alive: bool) -> None:
         if is_alive is peer.alive:
             return
-        peer.alive = is_alive
-        if is_alive:
-            self._found(peer)
-        else:
-            self._lost(peer)
-
-    def _lost(self, peer: _Peer) -> None:
-        peer.lost_at_s = self._loop.time()
-        if peer.machine:
-            self._system.emit(MachineConnection(machine=peer.machine, established=False))
-        detail = f"{peer.what} is not heard any more"
-        self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
-        self._participant.send_again_soon()
-        self._system.have_hosts(Operation.SEND_AGAIN_SOON)
-
-    def _found(self, peer: _Peer) -> None:
-        lost_s = 0.0
-        if peer.lost_at_s is not None:
-            lost_s = self._loop.time() - peer.lost_at_s
+        peer.alive, lost_s = is_alive, 0.0
+        if not is_alive:
+            peer.lost_at_s = self._loop.time()
+            self._participant.send_again_soon()
+            self._system.have_hosts(Operation.SEND_AGAIN_SOON)
+        elif peer.lost_at_s is not None:
+            lost_s, peer.lost_at_s = self._loop.time() - peer.lost_at_s, None
             # DDS may have forgotten the node names of participants that it lost for long.
             self._participant.republish_names()
             self._system.have_hosts(Operation.REPUBLISH_NAMES)
-        peer.lost_at_s = None
         if peer.machine:
             self._system.emit(
-                MachineConnection(machine=peer.machine, established=True, lost_s=lost_s)
+                MachineConnection(machine=peer.machine, established=is_alive, lost_s=lost_s)
             )
-        self._system.liveliness.came_back(peer.nodes, Cause.LOST)
+        why = "" if is_alive else f"{peer.what} is not heard any more"
+        self._system.liveliness.note(peer.nodes, Cause.LOST, why)
 
     def _left(self, peer: _Peer) -> None:
         """It left properly, or DDS forgot it after it was lost."""
@@ -263,17 +249,13 @@ class Peers:
         peer.alive = False
         if peer.machine:
             self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
-        self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
+        self._system.liveliness.note(peer.nodes, Cause.REPORTED, "")
 
     def _noticed(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
         if peer.machine:
             self._compare(peer, notice, sent_ns, received_ns)
-        silent = notice.silent
         for name in peer.nodes:
-            if name in silent:
-                self._system.liveliness.fell_silent((name,), Cause.REPORTED, silent[name])
-            else:
-                self._system.liveliness.came_back((name,), Cause.REPORTED)
+            self._system.liveliness.note((name,), Cause.REPORTED, notice.silent.get(name, ""))
 
     def _say(self) -> None:
         """Our own nodes fell silent or came back: say so."""
@@ -432,7 +414,11 @@ class Peers:
         for notice in self._known:
             if notice.checksum == ours:
                 continue
-            who = _who(notice, self._system.plan.system)
+            machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
+            of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
+            if notice.system != self._system.plan.system:
+                of = f"system {notice.system[:80]!r} on {of}"
+            who = f"the supervisor of {of}"
             theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
                 subject=who,
@@ -448,16 +434,14 @@ class Peers:
         started = (e for e in self._system.remote.values() if e.run.kind is not RunKind.ATTACH)
         there = {each.machine for each in started if each.full_name in seen}
         now_s = self._loop.time()
-        waits_s: list[float] = []
         for peer in self._supervisors:
             if not (peer.alive or peer.machine in there) or self._has_said(peer):
                 peer.unknown_since_s = None
                 continue
             if peer.unknown_since_s is None:
                 peer.unknown_since_s = now_s
+                self._loop.call_later(ANNOUNCED_S, self._touch)
             left_s = peer.unknown_since_s + ANNOUNCED_S - now_s
-            if left_s > 0:
-                waits_s.append(left_s)
             assert self._said is not None
             yield PLAN_UNKNOWN.finding(
                 outcome=Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
@@ -467,10 +451,10 @@ class Peers:
                 message=f"cannot tell whether {peer.what} planned the same system: it has not said"
                 + (" so yet" if left_s > 0 else f" what it planned within {ANNOUNCED_S:g} s"),
             )
-        if waits_s:
-            if self._again is not None:
-                self._again.cancel()
-            self._again = self._loop.call_later(min(waits_s), self._system.touch)
+
+    def _touch(self) -> None:
+        if self._notices is not None:  # else it was closed meanwhile
+            self._system.touch()
 
     def _has_said(self, peer: _Peer) -> bool:
         """Whether some notice is of a supervisor that runs its machine, or its nodes."""
@@ -485,11 +469,3 @@ def _forget(peer: _Peer) -> None:
     if peer.watch is not None:
         peer.watch.destroy()
         peer.watch = None
-
-
-def _who(notice: PlanNotice, system: str) -> str:
-    machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
-    of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
-    if notice.system == system:
-        return f"the supervisor of {of}"
-    return f"the supervisor of system {notice.system[:80]!r} on {of}"

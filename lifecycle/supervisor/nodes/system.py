@@ -153,11 +153,6 @@ class NodeRun:
         return shared and planned.namespace != "/" and bool(planned.parameters)
 
     @property
-    def is_marked(self) -> bool:
-        """Whether the plan says what DSCP any of its endpoints sends with."""
-        return any(each.dscp is not None for each in self.planned.endpoints)
-
-    @property
     def reports_health(self) -> bool:
         """Whether its host reports all that the manifest asks of its health."""
         asked = self.planned.health
@@ -406,22 +401,20 @@ class System:
             and not node.core.stuck
             and node.name not in self.liveliness.silent
         ]
-        await asyncio.gather(
-            *(
-                _refresh(node.driver)
-                for node in nodes
-                if isinstance(node.driver, ControlDriver)
-                and (node.configuration is None or (marks and node.is_marked))
-            )
-        )
+
+        async def ask(driver: ControlDriver) -> None:
+            with contextlib.suppress(BringUpError, asyncio.TimeoutError):
+                await asyncio.wait_for(driver.interface(), _REFRESH_S)
+
+        def is_asked(node: NodeRun) -> bool:
+            has_dscp = any(each.dscp is not None for each in node.planned.endpoints)
+            return node.configuration is None or (marks and has_dscp)
+
+        drivers = (each.driver for each in nodes if is_asked(each))
+        await asyncio.gather(*(ask(each) for each in drivers if isinstance(each, ControlDriver)))
         for node in nodes:
             if node.configuration is not None:
                 observer.state.put_configuration(node.configuration)
-
-
-async def _refresh(driver: ControlDriver) -> None:
-    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
-        await asyncio.wait_for(driver.interface(), _REFRESH_S)
 
 
 def level_of(node: NodeRun) -> Level:

@@ -28,9 +28,6 @@ _LONGEST_LINE = 1 << 24
 _CLOSE_S = 0.5
 """For a host to read what it was sent before."""
 
-_UNASKED = frozenset({"state", "configuration", "measured"})
-"""Events by which a host reports on a node without having been asked."""
-
 
 class ChannelClosedError(BringUpError):
     """The host closed its end: it is ending or has died."""
@@ -177,7 +174,7 @@ class ControlChannel:
                 self._ready.set_exception(failure)
         elif event.kind == "beat":
             self._on_hang(None)
-        elif event.kind in _UNASKED:
+        elif event.kind in ("state", "configuration", "measured"):
             self._on_state(event)
 
     def _look(self) -> None:

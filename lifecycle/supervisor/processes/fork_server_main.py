@@ -331,7 +331,8 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
         assert control is not None
         from lifecycle.node.host.host import serve
 
-        _reseed()
+        if (numpy_random := sys.modules.get("numpy.random")) is not None:
+            numpy_random.seed()  # CPython gives a fork random numbers of its own in `random` only
         return serve(socket.socket(fileno=control))
     if control is not None:
         os.set_inheritable(control, True)
@@ -343,13 +344,6 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
     except OSError as error:
         print(f"cannot run {argv[0]!r}: {error.strerror}", file=sys.stderr)
         return 126 if isinstance(error, PermissionError) else 127
-
-
-def _reseed() -> None:
-    """Give this fork random numbers of its own; CPython reseeds only its `random` module."""
-    numpy_random = sys.modules.get("numpy.random")
-    if numpy_random is not None:
-        numpy_random.seed()
 
 
 def _preload(types: Iterable[str]) -> None:

@@ -142,12 +142,11 @@ def begin_logs(environment: Mapping[str, str], path: Path, system: str) -> None:
     keep = int(given) if given.isascii() and given.isdigit() and int(given) else KEPT_RUNS
     for each in runs_of(path.parent, system)[keep:]:
         with contextlib.suppress(OSError):
-            _remove_run(each, system)
+            _remove_run(each)
 
 
-def _remove_run(path: Path, system: str) -> None:
+def _remove_run(path: Path) -> None:
     """Remove the logs of a run that is over, unless there is more in it."""
-    named = _named(system).fullmatch(path.name)
     files = list(path.iterdir())
     ours = all(
         each.name.endswith((".log", ".log.1", JOURNAL_NAME, f"{JOURNAL_NAME}.1"))
@@ -155,11 +154,10 @@ def _remove_run(path: Path, system: str) -> None:
         and not each.is_symlink()
         for each in files
     )
-    if named is None or not ours or Path(f"/proc/{named['pid']}").exists():
-        return
-    for each in files:
-        each.unlink()
-    path.rmdir()
+    if ours and not is_running(path):
+        for each in files:
+            each.unlink()
+        path.rmdir()
 
 
 class LineReader:

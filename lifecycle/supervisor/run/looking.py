@@ -21,7 +21,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError, UsageError
-from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
+from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.picture import Picture, Supervised, build_picture
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware.fastdds.discovery import peers_environment
@@ -48,8 +48,6 @@ from lifecycle.verify.tool_filter import tolerating_pattern
 from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.graph.graph import Graph
-    from lifecycle.middleware.services.clients import NodeClients
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 
@@ -358,9 +356,9 @@ def capture_running(
     system: str,
     domain_id: int,
     discovery_range: DiscoveryRange,
-    namespaces: tuple[str, ...] = (),
+    namespaces: tuple[str, ...],
     wait_s: float,
-    attach: bool = False,
+    attach: bool,
 ) -> CapturedSystem:
     """Return what runs in a domain now.
 
@@ -376,68 +374,45 @@ def capture_running(
         MiddlewareError: no participant can be made.
     """
     from lifecycle.graph.graph import Graph
+    from lifecycle.supervisor.nodes.observer_participant import settled
 
     environment = dict(os.environ)
     _enter_domain(domain_id, discovery_range)
 
-    async def look() -> tuple[Observation, _Parameters, str, Programs]:
+    async def look() -> CapturedSystem:
         with Graph.in_loop(domain_id) as graph:
-            return await _look(graph, wait_s, None if attach else environment)
+            (nodes, endpoints), unsettled = await settled(graph.discovery, wait_s)
+            # Before anything is asked: a program may end meanwhile.
+            programs = {} if attach else graph.discovery.programs(environment)
+            clients = graph.clients
+            said: dict[str, tuple[str | None, NodeConfiguration | None]] = {}
+            parameters: dict[str, tuple[CapturedParameter, ...] | None] = {}
 
-    observation, parameters, unsettled, programs = asyncio.run(look())
-    return capture(
-        observation,
-        parameters,
-        system=system,
-        domain_id=domain_id,
-        discovery_range=discovery_range,
-        namespaces=namespaces,
-        unsettled=unsettled,
-        programs=programs,
-    )
+            async def ask(node: ObservedNode) -> None:
+                name = node.full_name
+                serves = graph.discovery.offers(name, f"{name}/list_parameters")
+                state, configuration, found = await asyncio.gather(
+                    _or_none(clients.get_state(name, timeout_s=_ASK_S) if node.managed else None),
+                    _or_none(clients.get_configuration(name, timeout_s=_ASK_S)),
+                    _or_none(clients.get_parameters(name, timeout_s=_ASK_S) if serves else None),
+                )
+                said[name] = state, configuration
+                if serves:
+                    parameters[name] = found
 
+            await asyncio.gather(*map(ask, nodes))
+            return capture(
+                graph.state.observation(nodes, endpoints, said),
+                parameters,
+                system=system,
+                domain_id=domain_id,
+                discovery_range=discovery_range,
+                namespaces=namespaces,
+                unsettled=unsettled,
+                programs=note_ended(programs),
+            )
 
-_Parameters = dict[str, "tuple[CapturedParameter, ...] | None"]
-
-
-async def _look(
-    graph: Graph, wait_s: float, environment: Mapping[str, str] | None
-) -> tuple[Observation, _Parameters, str, Programs]:
-    from lifecycle.supervisor.nodes.observer_participant import settled
-
-    (nodes, endpoints), unsettled = await settled(graph.discovery, wait_s)
-    # Before anything is asked: a program may end meanwhile.
-    programs = {} if environment is None else graph.discovery.programs(environment)
-    serving = {
-        node.full_name
-        for node in nodes
-        if graph.discovery.offers(node.full_name, f"{node.full_name}/list_parameters")
-    }
-    answers = await asyncio.gather(
-        *(_ask(graph.clients, node, parameters=node.full_name in serving) for node in nodes)
-    )
-    names = [node.full_name for node in nodes]
-    said = {
-        name: (state, configuration)
-        for name, (state, configuration, _) in zip(names, answers, strict=True)
-    }
-    parameters = {
-        name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
-    }
-    observation = graph.state.observation(nodes, endpoints, said)
-    return observation, parameters, unsettled, note_ended(programs)
-
-
-async def _ask(
-    clients: NodeClients, node: ObservedNode, *, parameters: bool
-) -> tuple[str | None, NodeConfiguration | None, tuple[CapturedParameter, ...] | None]:
-    """Ask a node for its state, its configuration and its parameters, all at once."""
-    name = node.full_name
-    return await asyncio.gather(
-        _or_none(clients.get_state(name, timeout_s=_ASK_S) if node.managed else None),
-        _or_none(clients.get_configuration(name, timeout_s=_ASK_S)),
-        _or_none(clients.get_parameters(name, timeout_s=_ASK_S) if parameters else None),
-    )
+    return asyncio.run(look())
 
 
 async def _or_none(asked: Awaitable[T] | None) -> T | None:

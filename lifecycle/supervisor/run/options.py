@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import enum
 import ipaddress
-import socket
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -119,8 +118,20 @@ def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
                 f"declared: {allowed}"
             )
         return frozenset({machine})
-    own = _own_addresses() if any(each.address for each in plan.machines) else set[str]()
-    return frozenset({"", *(each.name for each in plan.machines if _is_local(each, own))})
+    own: set[str] = set()
+    if any(each.address for each in plan.machines):
+        import psutil  # which has them where a manifest is only checked, on other platforms, too
+
+        interfaces = psutil.net_if_addrs().values()
+        own |= {each.address.partition("%")[0] for addresses in interfaces for each in addresses}
+
+    def is_local(machine: Machine) -> bool:
+        if not machine.address:
+            return True
+        address = ipaddress.ip_address(machine.address)
+        return address.is_loopback or str(address) in own
+
+    return frozenset({"", *(each.name for each in filter(is_local, plan.machines))})
 
 
 def address_that_is_down(plan: Plan, machine: str) -> str:
@@ -207,21 +218,3 @@ def onlooker_connections(
             url = replace(url, peers=tuple(sorted({*url.peers, *listening})))
         urls.append(str(url))
     return replace(connections, urls=tuple(urls))
-
-
-def _own_addresses() -> set[str]:
-    import psutil  # which has them where a manifest is only checked, on other platforms, too
-
-    return {
-        address.address.partition("%")[0]
-        for addresses in psutil.net_if_addrs().values()
-        for address in addresses
-        if address.family in (socket.AF_INET, socket.AF_INET6)
-    }
-
-
-def _is_local(machine: Machine, own: set[str]) -> bool:
-    if not machine.address:
-        return True
-    address = ipaddress.ip_address(machine.address)
-    return address.is_loopback or str(address) in own

@@ -13,7 +13,7 @@ import os
 import re
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -42,7 +42,7 @@ from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.middleware.rcl.conversions import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.discovery import reached_hosts
-from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.plan.model import Plan
 from lifecycle.run_directory import (
     FORK_SERVER,
     RunDirectory,
@@ -132,13 +132,15 @@ def up(
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
     """
-    guarded = _Guarded(listener)
+    raised: list[Exception] = []
     processes = local_processes(plan, options.machine)
     service = ServiceManager(os.environ)
     emit = Emitter()
-    emit.listen(guarded)
+    emit.listen(_guarded(listener, raised))
     emit.listen(service.on_event)
-    _preload(process, plan, processes)
+    python = (each for each in processes if each.run.kind is RunKind.PYTHON)
+    nodes = (plan.node(key) for each in python for key in each.nodes)
+    process.preload(dict.fromkeys(each.type for node in nodes for each in node.endpoints))
     logs = log_directory(os.environ, plan.system)
     directory = RunDirectory.acquire(
         runtime_root(os.environ),
@@ -177,7 +179,17 @@ def up(
                     await discovery_server.begin(system, fork_server)
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
-                emit(_started(system, observer_participant, str(logs)))
+                emit(
+                    RunStarted(
+                        system=plan.system,
+                        domain_id=plan.domain_id,
+                        rmw=observer_participant.rmw,
+                        discovery_range=plan.discovery_range.value,
+                        nodes=tuple(each.name for each in system.nodes.values()),
+                        processes=tuple(system.run.processes),
+                        log_directory=str(logs),
+                    )
+                )
                 supervisor = Supervisor(
                     system,
                     Means(
@@ -206,29 +218,23 @@ def up(
         sweep(within_s=_LET_GO_S)
         journal.close()
         directory.release()
-    guarded.check()
+    if raised:
+        raise raised[0]
     return result
 
 
-class _Guarded:
-    """A listener whose exception ends no more than itself, see `up`."""
+def _guarded(listener: Listener, raised: list[Exception]) -> Listener:
+    """Return a listener whose exception ends no more than itself, see `up`."""
 
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
-        self._error: Exception | None = None
-
-    def __call__(self, event: Event) -> None:
-        if self._error is None:
+    def guarded(event: Event) -> None:
+        if not raised:
             try:
-                self._listener(event)
+                listener(event)
             except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
                 traceback.print_exc()
-                self._error = error
+                raised.append(error)
 
-    def check(self) -> None:
-        """Raise what the listener raised."""
-        if self._error is not None:
-            raise self._error
+    return guarded
 
 
 async def _leaving_last(
@@ -246,31 +252,15 @@ async def _leaving_last(
         exit_code = conclude(result)
         return replace(result, exit_code=exit_code)
     finally:
-        with _ends_within(LEAVE_S, exit_code):
+        with contextlib.ExitStack() as bounded:
+            bounded.callback(exit_after(LEAVE_S, exit_code))
             await leaving.aclose()
-
-
-def _preload(process: ForkServerProcess, plan: Plan, processes: Iterable[PlannedProcess]) -> None:
-    """Have a fork server load the interface types of our Python nodes, once for all of them."""
-    python = (each for each in processes if each.run.kind is RunKind.PYTHON)
-    nodes = (plan.node(key) for each in python for key in each.nodes)
-    process.preload(dict.fromkeys(each.type for node in nodes for each in node.endpoints))
 
 
 _LET_GO_S = 0.5
 """Others let go of the port of a participant that left when they next send over shared memory: most
 within milliseconds, one that sends nothing perhaps never. Then the port stays for who uses it next.
 """
-
-
-@contextlib.contextmanager
-def _ends_within(seconds: float, code: int) -> Iterator[None]:
-    """End this process with `code` if what is done inside takes longer: Fast DDS can hang."""
-    live_on = exit_after(seconds, code)
-    try:
-        yield
-    finally:
-        live_on()
 
 
 _SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
@@ -304,7 +294,9 @@ async def _observer_participant(
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
-    with _ends_within(options.bring_up_s(0) + LEAVE_S, ExitCode.BRING_UP_FAILED):
+    with contextlib.ExitStack() as bounded:
+        late_s = options.bring_up_s(0) + LEAVE_S
+        bounded.callback(exit_after(late_s, ExitCode.BRING_UP_FAILED))
         observer_participant = ObserverParticipant.open(
             plan.domain_id,
             observer_connections(plan, options.machine),
@@ -338,18 +330,6 @@ async def _observer_participant(
         message = f"nodes are found by the discovery server of {_SERVER_VARIABLE}={server}"
         emit(Notice(message=f"{message}; none is while it does not run"))
     return observer_participant
-
-
-def _started(system: System, observer_participant: ObserverParticipant, logs: str) -> RunStarted:
-    return RunStarted(
-        system=system.plan.system,
-        domain_id=system.plan.domain_id,
-        rmw=observer_participant.rmw,
-        discovery_range=system.plan.discovery_range.value,
-        nodes=tuple(each.name for each in system.nodes.values()),
-        processes=tuple(system.run.processes),
-        log_directory=logs,
-    )
 
 
 _GRAPH_VARIABLES = (

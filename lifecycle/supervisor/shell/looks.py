@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition, EndpointKind
 from lifecycle.measure.sample import SLOT_S
-from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
@@ -102,7 +102,6 @@ class Looks:
         self._decided: frozenset[object] = frozenset()  # by clocks, as they were confirmed
         self.seen = Observation()
         self._unsaid: dict[str, float] = {}
-        self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
         # Nodes that are not our hosts' and their participants' prefixes, and since when.
         self._active: dict[tuple[str, str], float] = {}
@@ -125,7 +124,9 @@ class Looks:
         # once; what the last of them report is on the way.
         passes = run.held_s is None and gate.allows(run) and not self._was_stale
         if self._latest is not None and not (passes and advance.stage_of(run) is Stage.CONNECTED):
-            await self._quiet()
+            until_s = loop.time() + BURST_S
+            while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
+                pass
         newcomers_until_s = loop.time() + gate.UNVERIFIABLE_S
         is_read_again = False
         while True:
@@ -134,12 +135,16 @@ class Looks:
             began = dict(self._system.processes)
             found = await self.judge(stage)
             closes = gate.closes(found, strict=run.options.strict)
-            if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
+            passage = run.passage
+            is_waited_for = (passage is not None and passage.at_gate) or advance.waiting(run)
+            if closes or stage is not Stage.CONNECTED or not is_waited_for:
                 break
             if not is_read_again:
                 is_read_again = True
                 # Nodes of others need not say that their parameters changed, or that they hang.
-                has_asked = await self._shell.answering.asked(self._left_s())
+                passage = run.asked or run.opening
+                left_s = 0.0 if passage is None else passage.until_s - self._shell.now_s()
+                has_asked = await self._shell.answering.asked(left_s)
                 if self._graph.reread_parameters() or has_asked:
                     continue
             lately = loop.time() < newcomers_until_s
@@ -148,16 +153,6 @@ class Looks:
         self._saw(self.seen, began)
         self._was_stale = run.mark != mark
         self._shell.give(self._verified(mark, stage, away, found))
-
-    def _is_waited_for(self) -> bool:
-        run = self._system.run
-        at_gate = run.passage is not None and run.passage.at_gate
-        return at_gate or bool(advance.waiting(run))
-
-    def _left_s(self) -> float:
-        run = self._system.run
-        passage = run.asked or run.opening
-        return 0.0 if passage is None else max(0.0, passage.until_s - self._shell.now_s())
 
     def _verified(
         self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
@@ -195,12 +190,6 @@ class Looks:
             away=away,
         )
 
-    async def _quiet(self) -> None:
-        loop = asyncio.get_running_loop()
-        until_s = loop.time() + BURST_S
-        while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
-            pass
-
     # One verdict
 
     async def judge(self, stage: Stage) -> Verdict:
@@ -212,7 +201,8 @@ class Looks:
             self._graph.measure_anew()
         system = self._system
         await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
-        seen = await self._graph.observe(self._plan_asked(), machines=system.machines)
+        awake = {each.full_name for each in system.plan.nodes} - system.liveliness.silent.keys()
+        seen = await self._graph.observe(system.plan, only=awake, machines=system.machines)
         observation = without(seen, system.dead())
         run = system.run
         is_measured = run.held_s is not None and run.passage is None
@@ -283,14 +273,6 @@ class Looks:
         times = tuple((name, now_s - each) for name, each in since_s.items())
         return replace(observation, active_s=times)
 
-    def _plan_asked(self) -> Plan:
-        """Return the plan without silent nodes; the same object while that is the same."""
-        of = self._system.plan, frozenset(self._system.liveliness.silent)
-        if self._asked_of is None or self._asked_of[0] is not of[0] or self._asked_of[1] != of[1]:
-            nodes = tuple(each for each in of[0].nodes if each.full_name not in of[1])
-            self._asked_of = (*of, replace(of[0], nodes=nodes) if of[1] else of[0])
-        return self._asked_of[2]
-
     def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
         """Return a verdict without peers that the graph cannot explain yet.
 
@@ -346,37 +328,28 @@ class Looks:
         """Look at nodes of others, and at ours that others may drive, while no verdict is made."""
         while True:
             changed = self._shell.changed
-            asked, looks = self._followed()
-            if looks and not self._is_looked_at():
-                began = dict(self._system.processes)
-                system = self._system
+            asked = self._followed()
+            system, run = self._system, self._system.run
+            is_looked_at = run.judged.looking or run.is_watched or advance.is_at_gate(run)
+            if (asked or system.plan.awaited) and not is_looked_at:
+                began = dict(system.processes)
                 seen = await self._graph.observe(system.plan, only=asked, machines=system.machines)
                 self._saw(seen, began)
-            remote = any(self._system.run.elsewhere.values())
+            remote = any(run.elsewhere.values())
             await set_within(changed, REMOTE_S if remote else None)
 
-    def _is_looked_at(self) -> bool:
-        run = self._system.run
-        return run.judged.looking or run.is_watched or advance.is_at_gate(run)
-
-    def _followed(self) -> tuple[frozenset[str], bool]:
-        """Return the names of the nodes that are asked, and whether it is to be looked at all."""
+    def _followed(self) -> frozenset[str]:
+        """Return the names of the nodes that are asked."""
         run, ready = self._system.run, self._system.plan.awaited
-        awaited = {after.node for each in run.nodes.values() for after in each.planned.after}
-        healthy = {
-            after.node
-            for each in run.nodes.values()
-            for after in each.planned.after
-            if after.condition is Condition.HEALTHY
-        }
-        keys = {key for key in run.elsewhere if key in awaited}
+        afters = [after for each in run.nodes.values() for after in each.planned.after]
+        healthy = {each.node for each in afters if each.condition is Condition.HEALTHY}
+        keys = {each.node for each in afters if each.node in run.elsewhere}
         for key, node in self._system.nodes.items():
             foreign = node.planned.managed and not node.is_hosted
             reads = any(not each.by.kinds for each in ready.get(key, ()))
             if foreign or reads or (key in healthy and not node.reports_health):
                 keys.add(key)
-        names = frozenset(each.full_name for each in run.plan.nodes if each.key in keys)
-        return names, bool(names or ready)
+        return frozenset(each.full_name for each in run.plan.nodes if each.key in keys)
 
     def _saw(self, seen: Observation, began: Mapping[str, ManagedProcess]) -> None:
         """Say what is seen of nodes that do not report to us, where that is new.

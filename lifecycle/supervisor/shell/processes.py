@@ -25,7 +25,6 @@ from lifecycle.verify.tool_filter import PREFIX_DIGITS
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from lifecycle.plan.model import PlannedNode
     from lifecycle.supervisor.nodes.system import NodeRun
     from lifecycle.supervisor.processes.process import ManagedProcess
     from lifecycle.supervisor.shell.supervisor import Supervisor
@@ -44,7 +43,7 @@ class Processes:
         shell: gets the inputs.
 
     Attributes:
-        releasing: what processes that ended had open is being closed; each ends within a second.
+        ends: of processes are being said, and what they had open is closed; each within a second.
     """
 
     def __init__(self, shell: Supervisor) -> None:
@@ -53,7 +52,7 @@ class Processes:
         self._means = shell.means
         self._belonging: dict[str, set[int]] = {}  # what processes had started as they were ended
         self._is_recorded = True
-        self.releasing: list[asyncio.Task[None]] = []
+        self.ends: list[asyncio.Task[None]] = []
 
     def spawn(self, effect: messages.Spawn) -> None:
         """Start a process."""
@@ -64,27 +63,28 @@ class Processes:
         system.processes[effect.process] = process
         for node in system.carried_by(effect.process):
             node.begin()
-        self._shell.start(self._spawn(process))
-
-    async def _spawn(self, process: ManagedProcess) -> None:
-        system = self._system
         nodes = [system.nodes[key] for key in process.planned.nodes]
         hung = system.liveliness.watch_over(process, [node.name for node in nodes])
         channel = None
         if process.planned.run.kind is RunKind.PYTHON:
+            files = (node.planned.at.file for node in nodes)
+            folders = (str(Path(each).absolute().parent) for each in files if each)
             spec = HostSpec(
                 system=system.plan.system,
                 process=process.name,
                 domain_id=system.plan.domain_id,
                 discovery_range=system.plan.discovery_range,
                 nodes=tuple(node.planned for node in nodes),
-                folders=manifest_folders(node.planned for node in nodes),
+                folders=tuple(dict.fromkeys(folders)),
                 log=process.log.shown,
                 joins=system.run.held_s is not None,
                 measures=bool(system.plan.bounds),
                 apart=self._apart(process),
             )
             channel = ControlChannel(spec, system.on_host_event, hung)
+        self._shell.start(self._spawn(process, channel))
+
+    async def _spawn(self, process: ManagedProcess, channel: ControlChannel | None) -> None:
         try:
             await process.spawn(self._means.fork_server, channel)
         except (BringUpError, OSError) as error:
@@ -94,7 +94,9 @@ class Processes:
             )
             await process.release()
             return
-        process.ended.add_done_callback(lambda _: self._ended(process))
+        process.ended.add_done_callback(
+            lambda _: self.ends.append(self._shell.start(self._say_end(process)))
+        )
         self._shell.give(
             messages.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
         )
@@ -106,6 +108,7 @@ class Processes:
         names = {each.pid: each.name for each in self._system.living}
         try:
             directory.record({**names, self._means.fork_server.pid: FORK_SERVER})
+            self._is_recorded = True
         except OSError as error:
             if self._is_recorded:
                 text = (
@@ -115,8 +118,6 @@ class Processes:
                 )
                 self._system.emit(Notice(message=text))
             self._is_recorded = False
-        else:
-            self._is_recorded = True
 
     def _apart(self, process: ManagedProcess) -> tuple[str, ...]:
         """Return the topics whose messages come by the clock of another host."""
@@ -132,26 +133,12 @@ class Processes:
         if self._system.plan.bounds:
             self._system.have_hosts(Operation.MEASURE, self._apart)
 
-    def _ended(self, process: ManagedProcess) -> None:
+    async def _say_end(self, process: ManagedProcess) -> None:
         """Say how a process ended; of one that was starting, once all is read that it said."""
-        try:
-            if process.channel is not None and self._is_starting(process):
-                self._shell.start(self._ended_early(process.channel, process))
-            else:
-                self._say_end(process)
-        except Exception as error:  # noqa: BLE001 - a callback of a future loses it
-            self._shell.broke(error)
-
-    def _is_starting(self, process: ManagedProcess) -> bool:
-        core = self._system.run.processes.get(process.name)
-        return core is not None and core.state is ProcessState.STARTING
-
-    async def _ended_early(self, channel: ControlChannel, process: ManagedProcess) -> None:
-        await channel.drained(_WORDS_S)
-        self._say_end(process)
-
-    def _say_end(self, process: ManagedProcess) -> None:
         system, channel = self._system, process.channel
+        known = system.run.processes.get(process.name)
+        if channel is not None and known is not None and known.state is ProcessState.STARTING:
+            await channel.drained(_WORDS_S)
         end = process.ended.result()
         carried = system.carried_by(process.name)
         self.forget(process.pid, carried)
@@ -171,7 +158,7 @@ class Processes:
                 ),
             )
         )
-        self.releasing.append(self._shell.start(process.release()))
+        await process.release()
 
     def signal(self, effect: messages.Signal) -> None:
         """Send a process a signal, or close its channel, by which a host of ours ends."""
@@ -246,9 +233,3 @@ def _reported(node: NodeRun) -> Iterable[str]:
     yield configuration.identity.node_id.rpartition("@")[2]
     for each in configuration.endpoints:
         yield each.gid[:PREFIX_DIGITS]
-
-
-def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
-    """Return the absolute folders of the manifests that declare some nodes."""
-    folders = (str(Path(node.at.file).absolute().parent) for node in nodes if node.at.file)
-    return tuple(dict.fromkeys(folders))

@@ -20,6 +20,7 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
+from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
@@ -34,12 +35,14 @@ from lifecycle.supervisor.nodes.driver import (
     NodeCondition,
     Permit,
     ServiceDriver,
-    ran_before,
+    where_it_runs,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
 from lifecycle.supervisor.run.events import Notice, RequestSent
 from lifecycle.verify.judge import with_findings
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.nodes import DUPLICATE_NODE
 from lifecycle.verify.verdict import NOT_JUDGED
 
 if TYPE_CHECKING:
@@ -218,7 +221,13 @@ class Requests:
         """Wait until a node is there, and know by what it is driven."""
         planned, process = node.planned, node.process
         if planned.run.component:
-            await self._load(node)
+            name = planned.run.container
+            container = self._system.nodes.get(name)
+            node.unload = await self._means.participant.clients.load_component(
+                planned,
+                name if container is None else container.name,
+                timeout_s=planned.timeouts.start_s,
+            )
         if process is not None and process.channel is not None:
             await process.channel.ready()
             if planned.holds:
@@ -226,7 +235,10 @@ class Requests:
             if planned.managed:
                 node.state = UNCONFIGURED
             return Level.STARTED
-        await self._appears(node.name)
+        changed = self._shell.changed
+        while not await self._shell.is_seen(node.name):  # the core sets the limit
+            await set_within(changed, None)
+            changed = self._shell.changed
         self._shell.give(messages.Saw(appeared=frozenset({node.core.key})))
         if planned.managed or node.is_to_be_given:
             self._check_alone(node)
@@ -251,31 +263,34 @@ class Requests:
             text = f"{node.name!r} is adopted, found {state}{where and f': {where}'}"
             self._system.emit(Notice(message=text))
 
-    async def _load(self, node: NodeRun) -> None:
-        name = node.planned.run.container
-        container = self._system.nodes.get(name)
-        full_name = name if container is None else container.name
-        node.unload = await self._means.participant.clients.load_component(
-            node.planned, full_name, timeout_s=node.planned.timeouts.start_s
-        )
-
-    async def _appears(self, name: str) -> None:
-        """Wait until discovery shows a node of this name; the core sets the limit."""
-        while True:
-            changed = self._shell.changed
-            if await self._shell.is_seen(name):
-                return
-            await set_within(changed, None)
-
     def _check_alone(self, node: NodeRun) -> None:
-        """Make sure, as well as it can be known, that only one node of its name is asked."""
+        """Make sure that no node of its name runs in a process that is older than ours.
+
+        Requests to services would reach both, and both would obey.
+        """
         process = node.process
-        if process is None or process.is_restarted:
+        if process is None or process.is_restarted or (began := start_ticks(process.pid)) is None:
             return
-        processes = self._means.participant.processes().get(node.name, {})
-        if found := ran_before(node, processes, self._means.fork_server.family()):
-            verdict = with_findings(NOT_JUDGED, found, self._system.expected.policy)
-            self._shell.give(messages.Refused(verdict=verdict))
+        family = self._means.fork_server.family()  # one may run it that is older: a container
+        older = {
+            pid: command
+            for pid, command in self._means.participant.processes().get(node.name, {}).items()
+            if pid not in family and (start_ticks(pid) or began) < began
+        }
+        if not older:
+            return
+        it = where_it_runs(older)
+        found = DUPLICATE_NODE.on(
+            node.planned,
+            outcome=Outcome.VIOLATED,
+            expected="1 node of this name",
+            observed=f"one more in {it}",
+            message=f"cannot drive {node.name}: a node of this name ran before ({it}), and would "
+            "obey, too",
+            hint="have it adopted: lifecycle up MANIFEST --adopt; or end it",
+        )
+        verdict = with_findings(NOT_JUDGED, (found,), self._system.expected.policy)
+        self._shell.give(messages.Refused(verdict=verdict))
 
     # Downwards
 

@@ -45,8 +45,8 @@ class GracePeriod:
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
-        self._demanded: dict[tuple[_Place, str], float] = {}
-        self._latest: dict[_Place, float] = {}
+        self._demands: frozenset[tuple[_Place, str]] = frozenset()
+        self._since: dict[_Place, float] = {}
         self._unknown: dict[FindingKey, float] = {}
 
     def after(
@@ -56,43 +56,34 @@ class GracePeriod:
 
         `last` held so far; None before the first.
         """
-        self._note(verdict, expected, now_s)
-        before = set() if last is None else {each.key for each in last.findings}
-        worse = [each for each in verdict.findings if each.key not in before]
-        healed = before - {each.key for each in verdict.findings}
-        if last is None or healed or not worse:
-            return verdict, None
-        left_s = [self._since(each) + PASSING_S - now_s for each in worse]
-        if min(left_s) <= 0:
-            return verdict, None
-        return last, min(left_s)
-
-    def _note(self, verdict: Verdict, expected: Plan, now_s: float) -> None:
         self._unknown = {
             each.key: self._unknown.get(each.key, now_s)
             for each in verdict.findings
             if _is_of_unknown_node(each)
         }
-        if expected is self._plan:
-            return
-        since = float("-inf") if self._plan is None else now_s
-        self._plan = expected
-        self._demanded = {each: self._demanded.get(each, since) for each in _demands(expected)}
-        self._latest = {}
-        for (place, _), since in self._demanded.items():
-            self._latest[place] = max(since, self._latest.get(place, since))
+        if expected is not self._plan:
+            demands = frozenset(_demands(expected))
+            if self._plan is not None:
+                self._since |= {place: now_s for place, _ in demands - self._demands}
+            self._plan, self._demands = expected, demands
+        known = set() if last is None else {each.key for each in last.findings}
+        worse = [each for each in verdict.findings if each.key not in known]
+        if last is None or not worse or known - {each.key for each in verdict.findings}:
+            return verdict, None
+        left_s = min(map(self._passes_s, worse)) - now_s
+        return (last, left_s) if left_s > 0 else (verdict, None)
 
-    def _since(self, finding: Finding) -> float:
-        """Return since when a finding may pass; -inf if it may not."""
-        if _is_of_unknown_node(finding):
-            return self._unknown[finding.key]
-        places: set[_Place] = {
+    def _passes_s(self, finding: Finding) -> float:
+        """Return until when a finding may pass; -inf if it may not."""
+        if finding.key in self._unknown:
+            return self._unknown[finding.key] + PASSING_S
+        places: list[_Place] = [
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
-        }
+        ]
         if rule(finding.rule).about is About.CONNECTION:
-            places.add(("connection", finding.node))
-        return max(self._latest.get(place, float("-inf")) for place in places)
+            places.append(("connection", finding.node))
+        return max(self._since.get(place, float("-inf")) for place in places) + PASSING_S
 
 
 def _is_of_unknown_node(finding: Finding) -> bool:

@@ -19,7 +19,6 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.graph.loop import ended
-from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
@@ -45,7 +44,6 @@ from lifecycle.supervisor.run.events import (
     LogLine,
     Notice,
     ProcessChanged,
-    StepFailedError,
     Stopped,
 )
 from lifecycle.supervisor.run.options import UpResult
@@ -53,7 +51,6 @@ from lifecycle.supervisor.run.signals import ENDED_BY, Ending
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
-from lifecycle.verify.judge import with_findings
 from lifecycle.verify.rules.catalogue import PROCESS_DIED
 from lifecycle.verify.verdict import NOT_JUDGED, Verdict
 
@@ -170,10 +167,6 @@ class Supervisor:
     def stop(self, reason: str, exit_code: ExitCode) -> None:
         """Ask the run to end; once it ends, an interrupt asks it to hurry."""
         self.give(messages.Stop(reason=reason, code=exit_code))
-
-    def differences(self, plan: Plan) -> tuple[str, ...]:
-        """Say how `plan` differs from what runs, one line each; empty if it does not."""
-        return difference_lines(changes(self.system.first, plan))
 
     async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
@@ -419,16 +412,7 @@ class Supervisor:
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started."""
-        try:
-            plan, findings = await adopt(self.system, self.means.participant)
-        except StepFailedError as failed:
-            self.give(messages.Broken(failure=failed.failure))
-            return
-        if findings:
-            verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
-            self.give(messages.Refused(verdict=verdict))
-        else:
-            self.give(messages.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
+        self.give(await adopt(self.system, self.means.participant))
 
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
@@ -516,7 +500,7 @@ class Supervisor:
 
     async def _leave_nothing(self) -> None:
         """Undo what is no process's: after the last message has left, and before strays end."""
-        await asyncio.gather(*self._processes.releasing)
+        await asyncio.gather(*self._processes.ends)
         await ended(*filter(None, (self._programming,)))
         if self._closing is not None:
             await asyncio.wait({self._closing})

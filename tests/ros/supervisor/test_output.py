@@ -24,7 +24,7 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.run_directory import short_path
-from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, ask
+from lifecycle.supervisor.control.protocol import ControlRequest, Question, ask
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
@@ -68,7 +68,7 @@ class _Run:
         """Ask over the control socket; a process for each question would take far longer."""
         for path in (self.runtime / "lifecycle").glob("pair@*/control"):
             with contextlib.suppress(OSError):
-                answer = ask(path, Question(ask=ControlRequest.STATUS), BOUND_S, Answer)
+                answer = ask(path, Question(ask=ControlRequest.STATUS), BOUND_S)
                 if answer is not None and answer.status is not None:
                     return answer.status.phase
         return ""

@@ -222,9 +222,9 @@ class FakeParticipant(FakeAir):
         only: Collection[str] | None = None,
         machines: Collection[str] | None = None,
     ) -> Observation:
-        del only, machines
+        del machines
         self.looks += 1
-        self.asked = [each.key for each in plan.nodes]
+        self.asked = [each.key for each in plan.nodes if only is None or each.full_name in only]
         hosted = [name for names in self._hosts.nodes.values() for name in names]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(

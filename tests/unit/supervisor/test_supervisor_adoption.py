@@ -188,7 +188,7 @@ async def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both have the services by which ours is driven."""
-    older = "lifecycle.supervisor.nodes.driver.start_ticks"
+    older = "lifecycle.supervisor.shell.requests.start_ticks"
     monkeypatch.setattr(older, lambda pid: 1 if pid == 7 else 2)
 
     world = SessionWorld(plan_of(planned_node("new", kind=RunKind.COMMAND)), tmp_path)

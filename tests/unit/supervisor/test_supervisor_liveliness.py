@@ -40,11 +40,11 @@ class Ears:
 
 def test_a_silent_node_is_told_once_and_alive_when_its_last_cause_is_gone() -> None:
     ears = Ears()
-    ears.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
-    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-    ears.liveliness.came_back(["/camera"], Cause.STOPPED)
+    ears.liveliness.note(["/camera"], Cause.STOPPED, "it was stopped")
+    ears.liveliness.note(["/camera"], Cause.HUNG, "it hangs")
+    ears.liveliness.note(["/camera"], Cause.STOPPED, "")
     assert ears.kinds == ["silent"]
-    ears.liveliness.came_back(["/camera"], Cause.HUNG)
+    ears.liveliness.note(["/camera"], Cause.HUNG, "")
     assert ears.kinds == ["silent", "alive"]
     assert ears.liveliness.silent == {}
     assert ears.changes == 4
@@ -53,7 +53,7 @@ def test_a_silent_node_is_told_once_and_alive_when_its_last_cause_is_gone() -> N
 def test_who_hangs_may_come_back_and_who_is_stopped_or_lost_is_out_of_reach() -> None:
     ears = Ears()
     for node, cause in (("/a", Cause.HUNG), ("/b", Cause.STOPPED), ("/c", Cause.LOST)):
-        ears.liveliness.fell_silent([node], cause, "it is")
+        ears.liveliness.note([node], cause, "it is")
     reached = {node: not ears.liveliness.is_out_of_reach(node) for node in ("/a", "/b", "/c", "/d")}
     assert reached == {"/a": True, "/b": False, "/c": False, "/d": True}
 

@@ -135,8 +135,8 @@ async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_
 ) -> None:
     robot = Robot(tmp_path)
     # Stopped in the middle of an import, and continued: it has not begun to live.
-    robot.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
-    robot.system.liveliness.came_back(["/camera"], Cause.STOPPED)
+    robot.system.liveliness.note(["/camera"], Cause.STOPPED, "it was stopped")
+    robot.system.liveliness.note(["/camera"], Cause.STOPPED, "")
     # A supervisor that was started anew has not started its nodes yet.
     await robot.alive(True)
     await robot.alive(False)
@@ -160,9 +160,9 @@ async def test_silence_is_said_again_and_again_and_that_of_others_is_taken_over(
     robot.desk.silent({})
     await settle()
     assert robot.said() == [("silent", "/viewer"), ("alive", "/viewer")]
-    robot.system.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    robot.system.liveliness.note(["/camera"], Cause.HUNG, "it hangs")
     await asyncio.sleep(1)
-    robot.system.liveliness.came_back(["/camera"], Cause.HUNG)
+    robot.system.liveliness.note(["/camera"], Cause.HUNG, "")
     await asyncio.sleep(1)
     (said,) = robot.air.announced.values()
     assert said[-6:] == [{"/camera": "it hangs"}] * 3 + [{}] * 3

@@ -167,7 +167,7 @@ async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) ->
 async def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
     world = SessionWorld(OFFERING, tmp_path, stop_after_s=5.0)
     async with world.running("[system] active"):
-        world.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "pid 7")
+        world.system.liveliness.note(["/camera"], Cause.STOPPED, "pid 7")
         await asyncio.sleep(1.1)
         assert world.graph.ros is not None
         assert world.graph.ros.diagnostics[-1][0][0] == STALE
