@@ -104,7 +104,6 @@ def apply(run: Run, order: Order) -> list[Event]:
     assert plan is not None
     change = change_to(run, plan)
     if not change.differences:
-        run.answer(ExitCode.OK)
         return []
     known = {each.key for each in plan.nodes}
     failed = {
@@ -221,9 +220,8 @@ def _take(run: Run, change: Change) -> None:
     change.taken, change.down = True, set()
     run.came = bool(change.touched)
     run.changed()
-    keys = change.active if change.back else None
     until = Until.VERIFIED if run.paused else Until.ACTIVE
-    run.passage = Passage(until_s=change.until_s, until=until, keys=keys)
+    run.passage = Passage(until_s=change.until_s, until=until)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:

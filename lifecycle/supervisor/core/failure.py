@@ -106,7 +106,7 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    barks = process.asked < 0 and bool(process.sent)  # nobody else has sent it anything then
+    barks = process.escalation is None and bool(process.sent)  # nobody else has sent it anything then
     hangs = next((each.hangs for each in members if each.hangs and barks), "")
     after_s = process.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""

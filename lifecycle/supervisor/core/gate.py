@@ -149,7 +149,6 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
     before, judged.verdict = judged.verdict, verdict
-    see_violations(run)
     is_same = before is not None and apart_from_numbers(verdict) == apart_from_numbers(before)
     return None if is_same else verdict
 
@@ -157,7 +156,7 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
 def is_foreign_activation(node: Node) -> bool:
     """Return whether a node is active that the gate has not let through."""
     found = node.level is Level.ACTIVE and node.base < Level.ACTIVE
-    return found and node.planned.managed and node.guarded > 0 and not node.let_through
+    return found and node.guarded > 0 and not node.let_through
 
 
 def _guarded(node: Node) -> Finding:

@@ -142,7 +142,6 @@ def _say_waiting(run: Run, passage: Passage) -> list[Event]:
 
 
 def _begin(run: Run, passage: Passage) -> None:
-    run.judged.violated = {}
     passage.begun_s, passage.waiting, passage.paused = run.now_s, advance.waiting(run), run.paused
     if not passage.asked:
         passage.until_s = run.now_s + gate.AGAIN_S

@@ -126,7 +126,7 @@ class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
     Attributes:
-        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
+        limit_s: that the manifest sets.
         waited_s: of the time since, without CPU: it does not count.
         said: it was said that it takes long.
     """
@@ -135,7 +135,6 @@ class Request(msgspec.Struct, kw_only=True):
     step: Step
     since_s: float
     limit_s: float
-    own_s: float = 0.0
     waited_s: float = 0.0
     said: bool = False
 
@@ -238,6 +237,10 @@ class Node(msgspec.Struct, kw_only=True):
         return Level.STARTED if is_plain else REACHES[step]
 
 
+Escalation = tuple[tuple[int, float], ...]
+"""Steps to end a process: (signal number, 0 to close its channel; seconds until the next)."""
+
+
 class Process(msgspec.Struct, kw_only=True):
     """One process that this supervisor starts.
 
@@ -253,7 +256,7 @@ class Process(msgspec.Struct, kw_only=True):
         by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
-        asked: index of the step of its escalation that was taken last; -1 before.
+        escalation: what is left of the steps to end it; None before it is asked to end.
         asked_until_s: then the next one is taken.
         sent: signals that it was sent.
         stays_down: it is not started again: it ended as it may, or the run goes on without it.
@@ -274,7 +277,7 @@ class Process(msgspec.Struct, kw_only=True):
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
-    asked: int = -1
+    escalation: Escalation | None = None
     asked_until_s: float = NEVER_S
     sent: list[int] = []
     stays_down: bool = False
@@ -335,7 +338,6 @@ class Passage(msgspec.Struct, kw_only=True):
         asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
         until: CONNECTED: they are only to come to the gate, VERIFIED: it is only judged, ACTIVE: it
             lets them through.
-        keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
         tries: nodes that were started again at it, by full name, and how often.
@@ -352,7 +354,6 @@ class Passage(msgspec.Struct, kw_only=True):
     until_s: float
     asked: bool = True
     until: Until = Until.ACTIVE
-    keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
     tries: Counter[str] = msgspec.field(default_factory=Counter)
@@ -371,11 +372,6 @@ class Passage(msgspec.Struct, kw_only=True):
     def is_programmed(self) -> bool:
         """Whether networks have the flows."""
         return self.flows is not None and not self.programming
-
-    def lets_go(self, key: str) -> bool:
-        """Return whether a node is to be let through that was kept inactive until now."""
-        opens = self.asked and self.until is Until.ACTIVE
-        return opens and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
