@@ -37,8 +37,8 @@ OWN_S = 0.5
 """Our hosts keep the limits of transitions themselves and know more: they speak first."""
 
 GLANCE_S = 1.0
-"""More for a run whose time is over: for the last look, for the verdict on a system that is to be
-no more than connected, and for other supervisors to say that they end, too."""
+"""More for a run whose time is over, and whose last verdict is not of now or not ok: others may be
+about to say that they end, too."""
 
 HOST: Escalation = ((0, 2.0), (SIGINT, 2.0), (SIGTERM, 1.0), (SIGKILL, NEVER_S))
 """Destroying a participant may hang for good."""

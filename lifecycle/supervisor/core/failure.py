@@ -106,7 +106,7 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    barks = process.escalation is None and bool(process.sent)  # nobody else has sent it anything then
+    barks = process.escalation is None and bool(process.sent)  # it was sent nothing else
     hangs = next((each.hangs for each in members if each.hangs and barks), "")
     after_s = process.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
@@ -217,8 +217,8 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
         return [*events, *fail(run, failure, end)]  # what fails of others counts as ever
     if process is not None and process.failed:
         return []  # it is to be started again for another failure already
-    if _is_covered(process, end):
-        assert process is not None
+    status = None if end is None else end.status
+    if process is not None and is_restarted(process.how, status):
         _cut_short(run, failure)
         return _back_off(run, process, failure, end)
     died = end is not None or failure.rule == PROCESS_DIED.id
@@ -231,12 +231,9 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
     if not run.failures:
         run.fails_s = run.now_s + ALSO_S
     # One that says why it cannot go on, and ends, has failed once.
-    dead = failure.process if failure.rule == PROCESS_DIED.id else ""
-    if not any(
-        (each.rule, each.subject) == (failure.rule, failure.subject)
-        or (dead and each.process == dead)
-        for each in run.failures
-    ):
+    ends = failure.rule == PROCESS_DIED.id and failure.process != ""
+    known = {each.process if ends else (each.rule, each.subject) for each in run.failures}
+    if (failure.process if ends else (failure.rule, failure.subject)) not in known:
         run.failures.append(failure)
     return []
 
@@ -254,12 +251,6 @@ def _is_of_change(run: Run, change: Change, failure: Failure, end: Exited | None
     return True
 
 
-def _is_covered(process: Process | None, end: Exited | None) -> bool:
-    if process is None or process.stays_down:
-        return False
-    return is_restarted(process.how, None if end is None else end.status)
-
-
 def goes_on(failure: Failure) -> Failure:
     """Return a failure as one that does not end the run."""
     return replace(failure, ends_run=False)
@@ -267,15 +258,10 @@ def goes_on(failure: Failure) -> Failure:
 
 def _cut_short(run: Run, failure: Failure) -> None:
     """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
-    order = run.order
     run.shut_gate()
-    if order is None or run.change is not None:
-        if run.change is not None:
-            run.change.again = failure.message
-        if run.passage is not None:
-            run.passage.at_gate = False
-            run.passage.until_s = run.now_s + run.timeout_s
-    elif order.ask is not ControlRequest.PAUSE:
+    if run.change is not None:
+        run.change.again = failure.message
+    elif run.order is not None and run.order.ask is not ControlRequest.PAUSE:
         run.passage, run.switch, run.to_give = None, None, {}
         run.answer(ExitCode.BRING_UP_FAILED, failure.message)
 
@@ -297,8 +283,8 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
         node.renew, node.due_s = True, max(node.due_s, due_s)
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
-    if run.passage is not None and run.held_s is None:
-        run.passage.until_s = due_s + run.timeout_s
+    if run.passage is not None:
+        run.passage.at_gate, run.passage.until_s = False, due_s + run.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,
@@ -460,38 +446,27 @@ def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
         return ExitCode.BRING_UP_FAILED, _named(run.deaths)
     if run.options.until is Until.CONNECTED or verdict is None:
         return ExitCode.OK, ""
-    left = follows_from_shut_down(run, verdict)
+    left = _follows_from_shut_down(run, verdict)
     withheld = any(each.withheld for each in run.nodes.values())
     held = (withheld or phase_of(run) == "held") and run.options.until is Until.ACTIVE
     closed = gate.closes(verdict, strict=run.options.strict) and not left
     down = ", ".join(each.name for each in run.processes.values() if each.failed)
+    violated = closed and verdict.verdict is Outcome.VIOLATED
     found = (
-        (closed and verdict.verdict is Outcome.VIOLATED, f"violated; {not_ok(verdict)}"),
-        (bool(meanwhile), f"violated meanwhile, {meanwhile}"),
-        (closed, f"unverifiable; {not_ok(verdict)}"),
-        (held, "held at the gate, and not active"),
-        (bool(down), f"down, and to be started again: {down}"),
+        (violated, ExitCode.VIOLATED, f"violated; {not_ok(verdict)}"),
+        (meanwhile, ExitCode.VIOLATED, f"violated meanwhile, {meanwhile}"),
+        (closed, ExitCode.UNVERIFIABLE, f"unverifiable; {not_ok(verdict)}"),
+        (held, ExitCode.VIOLATED, "held at the gate, and not active"),
+        (down, ExitCode.VIOLATED, f"down, and to be started again: {down}"),
     )
-    why = next((text for holds, text in found if holds), "")
-    unverifiable = ExitCode.UNVERIFIABLE if why.startswith("unver") else ExitCode.VIOLATED
-    return (unverifiable if why else ExitCode.OK), why
+    return next(((code, why) for holds, code, why in found if holds), (ExitCode.OK, ""))
 
 
 def _named(failures: Iterable[Failure]) -> str:
     return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in failures)}"
 
 
-def only_elsewhere(run: Run) -> bool:
-    """Return whether all that is violated is of nodes of supervisors not known to end."""
-    verdict = run.judged.verdict
-    found = () if verdict is None else verdict.findings
-    violated = [each for each in found if each.outcome is Outcome.VIOLATED]
-    names = {run.plan.node(key).full_name for key in run.elsewhere}
-    elsewhere = violated and all(not names.isdisjoint(each.nodes) for each in violated)
-    return bool(elsewhere) and verdict is not None and not follows_from_shut_down(run, verdict)
-
-
-def follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
+def _follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
     """Return whether nothing is violated but the absence of hosts that were shut down properly."""
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     return bool(violated) and all(
@@ -529,8 +504,6 @@ def fail_late(run: Run, why: str) -> list[Event]:
     events = fail(run, _failure(DEADLINE, subject, text, process))
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
-    if run.passage is not None:
-        # What is started again may be due later.
-        again_s = max(run.passage.until_s, run.now_s + run.timeout_s)
-        run.passage.until_s = NEVER_S if run.failures else again_s
+    elif run.passage is not None:  # what is started again may be due later
+        run.passage.until_s = max(run.passage.until_s, run.now_s + run.timeout_s)
     return events

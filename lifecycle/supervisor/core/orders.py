@@ -111,14 +111,13 @@ def named(run: Run, name: str) -> Node | None:
     return node if ours else None
 
 
-def take_order(run: Run, order: Order) -> list[Event]:
+def take_order(run: Run, order: Order) -> None:
     """Take an order: it is refused at once, carried out, or waits for the one under way."""
     code, why = refused_at_once(run, order)
     if why:
-        run.outbox = [*run.outbox, (order.id, code, why)]
+        run.outbox.append((order.id, code, why))
     else:
         run.orders.append(order)
-    return []
 
 
 def refused_at_once(run: Run, order: Order) -> tuple[ExitCode, str]:
@@ -146,7 +145,7 @@ def settle_orders(run: Run) -> list[Event]:
     while run.order is None and run.orders and _is_free(run):
         order = run.orders.popleft()
         if why := refusal(run, order):
-            run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
+            run.outbox.append((order.id, ExitCode.USAGE, why))
             continue
         run.order = order
         events += _begin(run, order)

@@ -41,7 +41,6 @@ from lifecycle.supervisor.core.state import (
     install,
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
-from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
 
 _UPWARDS = (*UP.values(), Step.WIRE)
@@ -324,6 +323,11 @@ def _broken(run: Run, given: messages.Broken) -> list[Event]:
     return []
 
 
+def _ordered(run: Run, given: messages.Ordered) -> list[Event]:
+    orders.take_order(run, given.order)
+    return []
+
+
 def _changed(run: Run, _: messages.Changed) -> list[Event]:
     run.changed()
     return []
@@ -340,7 +344,7 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     messages.Verified: _verified,
     messages.Programmed: passing.programmed,
     messages.Given: _given,
-    messages.Ordered: lambda run, given: orders.take_order(run, given.order),
+    messages.Ordered: _ordered,
     messages.Stop: _stop,
     messages.Silent: _silent,
     messages.Adopted: _adopted,
@@ -405,9 +409,7 @@ def _hold(run: Run) -> list[Event]:
     over_s = NEVER_S if hold_s is None else run.decided_s + hold_s
     if not run.is_past(over_s) or run.order is not None or run.failures:
         return said
-    waits = not gate.is_latest(run) or failure.only_elsewhere(run)
-    if run.options.until is Until.CONNECTED:
-        waits = waits or not gate.allows(run)
+    waits = not (gate.is_latest(run) and gate.allows(run))
     if waits and not run.is_past(over_s + advance.GLANCE_S):
         return said
     return [*said, *failure.end_done(run)]

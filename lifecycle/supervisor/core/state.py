@@ -658,7 +658,7 @@ class Run(msgspec.Struct, kw_only=True):
         """Answer the order that is carried out, and be done with it."""
         if self.order is not None:
             code, error = self.undone or (code, error)
-            self.outbox = [*self.outbox, (self.order.id, code, error)]
+            self.outbox.append((self.order.id, code, error))
         self.order, self.undone = None, None
 
     def fails_now(self, *failures: Failure) -> None:
