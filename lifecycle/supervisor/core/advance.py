@@ -123,7 +123,7 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
         if step <= target and not has_reached(run, after.node, after.condition):
             return _awaited(run, after)
     container = run.nodes.get(node.planned.run.container)
-    if node.planned.run.component and container is not None and container.level < Level.STARTED:
+    if container is not None and container.level < Level.STARTED:
         return f"{container.name} is started"
     if target is Level.CONNECTED and run.wires and not node.wired:
         # What a negotiation asks of a node must not wait for a connection of another.
@@ -160,7 +160,7 @@ def is_walking(run: Run, node: Node) -> bool:
     goal = goal_of(run, node)
     if only_appears(node) and goal:  # it reports nothing: a verdict says whether it is there
         process = run.processes.get(node.process)
-        return bool(node.process) and (process is None or not process.is_alive)
+        return process is not None and not process.is_alive
     return min(goal, node.gate) > node.level or goal < node.may_be_at or node.renew
 
 
@@ -168,14 +168,6 @@ def only_appears(node: Node) -> bool:
     """Return whether all that is known of a node's start is that it is in the graph."""
     run = node.planned.run
     return run.kind is not RunKind.PYTHON and not (node.planned.managed or run.component)
-
-
-def is_awaited(run: Run) -> bool:
-    """Return whether a node of ours that is to be there, and only appears, has not appeared."""
-    return any(
-        each.process and only_appears(each) and each.level < Level.STARTED <= wanted(run, each)
-        for each in run.nodes.values()
-    )
 
 
 def is_at_gate(run: Run) -> bool:
@@ -206,7 +198,7 @@ def advance(run: Run) -> list[messages.Effect]:
         messages.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
     ]
     run.outbox = []
-    if run.adopting and run.ending is None:
+    if run.adopting:
         return found
     for process in run.processes.values():
         found += _process(run, process)
@@ -232,7 +224,7 @@ def _next(run: Run, node: Node) -> Step | None:
     goal = goal_of(run, node)
     if node.level > goal:
         return _step_down(run, node, goal)
-    if node.level < goal and run.fails_s == NEVER_S and run.ending is None:
+    if node.level < goal and not run.failures and run.ending is None:
         return _step_up(run, node)
     return None
 
@@ -242,7 +234,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if node.stuck or (node.silent and target is not Level.STARTED):
         return None
     process = run.processes.get(node.process)
-    if node.process and (process is None or not process.pid or process.escalation is not None):
+    if process is not None and (not process.pid or process.escalation is not None):
         return None
     if holds_up(run, node, target):
         return None
@@ -262,7 +254,7 @@ def _step_down(run: Run, node: Node, goal: Level) -> Step | None:
     asked = can_be_asked(run, node) if goal is Level.DOWN else not node.stuck
     if not asked or _waits_for_dependents(run, node, wanted(run, node)):
         return None
-    if process is not None and (not process.is_alive or process.escalation is not None):
+    if process is not None and process.escalation is not None:
         return None
     if node.level is not Level.STARTED:
         return DOWNWARDS[node.level]
@@ -290,8 +282,9 @@ def _waits_for_dependents(run: Run, node: Node, goal: Level) -> bool:
 def _goes_with_container(run: Run, node: Node) -> bool:
     """Return whether a node is a component whose container's process ends, too."""
     container = run.nodes.get(node.planned.run.container)
-    loaded = node.planned.run.component and container is not None and container.process
-    return bool(loaded) and container is not None and wanted(run, container) is Level.DOWN
+    if container is None or not container.process:
+        return False
+    return wanted(run, container) is Level.DOWN
 
 
 def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
@@ -342,9 +335,8 @@ def _process(run: Run, process: Process) -> Iterator[messages.Effect]:
 
 def _may_be_spawned(run: Run, process: Process) -> bool:
     members = [*run.nodes_of(process.name)]
-    if run.fails_s < NEVER_S or is_to_end(run, process):
-        return False
-    return not any(holds_up(run, each, Level.STARTED) for each in members)
+    held = any(holds_up(run, each, Level.STARTED) for each in members)
+    return not (run.failures or is_to_end(run, process) or held)
 
 
 def _barks_at_s(run: Run, process: Process) -> float:
@@ -436,7 +428,7 @@ def phase_of(run: Run) -> str:
         (run.change is not None, "applying"),
         (run.switch is not None, "switching"),
         (run.opening is not None, "activating"),
-        (run.paused and pausing, "pausing"),
+        (pausing, "pausing"),
         (coming, "restarting" if up else "connecting"),
         (run.asked is not None, "verifying"),
         (run.paused, "paused"),

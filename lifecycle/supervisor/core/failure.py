@@ -7,6 +7,7 @@ for people, and how a run ends: `end` and the exit code. Pure.
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Iterable
 
 from msgspec.structs import replace
@@ -87,10 +88,11 @@ def doing(run: Run, node: Node) -> str:
 def unfinished(run: Run) -> str:
     """Say what every node is doing, or waits for, that is in a step; empty if none is."""
     found = ((each.name, doing(run, each)) for each in run.nodes.values())
-    said = (
-        (name, text if text.startswith("waits") else f"is still {text}") for name, text in found
+    return "; ".join(
+        f"{name} {'' if text.startswith('waits') else 'is still '}{text}"
+        for name, text in found
+        if text
     )
-    return "; ".join(f"{name} {text}" for name, text in said if not text.endswith("still "))
 
 
 def death(run: Run, process: Process, given: Exited) -> list[Failure]:
@@ -127,23 +129,15 @@ def _not_run(process: Process, given: Exited) -> str:
 
 def forced(process: Process) -> Event:
     """Return what is said of a process that did not end when it was asked to."""
-    name = _SIGNALS.get(process.sent[-1], str(process.sent[-1]))
+    name = signal.Signals(process.sent[-1]).name
     return Notice(message=f"process {process.name!r} had to be ended with {name}")
 
 
 def activated(node: Node) -> Event:
     """Return what is said of a node that the gate has not let through, and that is active."""
-    text = f"{node.name!r} {gate.BY_ITSELF}"
-    tries = gate.GUARD_TRIES
-    if node.guarded < tries:
-        return Notice(message=f"{text}: it is deactivated")
-    if node.guarded == tries:
-        in_vain = f"it is deactivated for the last time, after {tries - 1} times in vain"
-        return Notice(message=f"{text}: {in_vain}")
-    return Notice(message=f"{text}: {gate.ACTIVATES_ITSELF}")
-
-
-_SIGNALS = {2: "SIGINT", 9: "SIGKILL", 15: "SIGTERM"}
+    is_guarded = node.guarded <= gate.GUARD_TRIES
+    what = "it is deactivated" if is_guarded else gate.ACTIVATES_ITSELF
+    return Notice(message=f"{node.name!r} {gate.BY_ITSELF}: {what}")
 
 
 def _start_failed(name: str, text: str) -> str:
@@ -225,7 +219,6 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
     if run.options.keep_going and run.held_s is not None and died:
         if process is not None:
             process.stays_down = True
-        run.judged.counted = run.judged.counted or _named([failure])
         run.deaths.append(failure)
         return [goes_on(failure)]
     if not run.failures:
@@ -429,11 +422,13 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
         code, why = _outcome(run, "")
         if asked in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             code = asked
-        elif code is ExitCode.OK and run.options.hold_s is not None:
+        elif code is not ExitCode.OK:
+            pass  # it was no success before it was asked to end
+        elif run.options.hold_s is not None:
             code, why = asked, f"it did not hold for the {run.options.hold_s:g} s of --stop-after"
-        elif code is ExitCode.OK and run.options.until is Until.ACTIVE and not is_kept:
+        elif not is_kept:
             code, why = asked, f"the system was {phase_of(run)}, not active"
-        elif code is ExitCode.OK and run.judged.counted:
+        elif run.judged.counted:
             why = f"violated meanwhile, {run.judged.counted}"
     said = f"{reason}; {why}" if why else reason
     return end(run, Ending(code=code, stopping=reason, reason=said))
@@ -487,18 +482,17 @@ def exit_code_of(run: Run) -> ExitCode:
 
 def fail_late(run: Run, why: str) -> list[Event]:
     """Fail a bring-up, or an order, that takes too long: say what nodes were doing, or why."""
-    busy = [
+    busy = (
         each
         for each in run.nodes.values()
         if each.request is not None and wanted(run, each) is not Level.DOWN
-    ]
-    culprit = busy[0] if busy else None
+    )
+    culprit, change = next(busy, None), run.change
     subject = run.plan.system if culprit is None else culprit.name
+    timeout_s = run.timeout_s if change is None or change.back else change.timeout_s
     why = unfinished(run) or why
-    text = f"cannot bring up {run.plan.system!r} within {run.timeout_s:.3g} s: {why}"
+    text = f"cannot bring up {run.plan.system!r} within {timeout_s:.3g} s: {why}"
     text += next(filter(None, (_advice(run, each) for each in run.nodes.values())), "")
-    for node in busy:
-        node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)
     run.shut_gate()
     events = fail(run, _failure(DEADLINE, subject, text, process))

@@ -125,7 +125,7 @@ def refuses_at_s(run: Run, until_s: float) -> float:
         return until_s  # what speaks against it is being mended
     if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
         return run.now_s
-    if not all(run.is_past(each.due_s) for each in run.nodes.values()):
+    if run.is_backing_off:
         return until_s  # what comes again may mend it
     over_s = judged.since_s + patience_s(judged.verdict)
     lasts = is_latest(run) or judged.seen_s >= over_s

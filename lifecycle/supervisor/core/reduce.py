@@ -73,15 +73,18 @@ def _settle(run: Run) -> list[Event]:
         events += failure.end_failed(run)
     _give_up_steps(run)
     _begin_anew(run)
-    if run.ending is None:
-        events += settle_mode(run)
-        events += settle_change(run)
-        events += passing.settle(run)
-        events += passing.settle_first_contact(run)
-        events += orders.settle_orders(run)
-        events += orders.settle_consequences(run)
-        events += failure.say_slow(run)
-        events += _hold(run)
+    for settle in (
+        settle_mode,
+        settle_change,
+        passing.settle,
+        passing.settle_first_contact,
+        orders.settle_orders,
+        orders.settle_consequences,
+        failure.say_slow,
+        _hold,
+    ):
+        if run.ending is None:
+            events += settle(run)
     if passage is not None and run.passage is None and (was_held or gate.has_probation(run)):
         run.changed()  # a look that began on the way through the gate measures nothing
         run.probation = run.mark
@@ -120,9 +123,10 @@ def _exited(run: Run, given: messages.Exited) -> list[Event]:
         return []
     if not expected:
         return [event for each in failures for event in failure.fail(run, each, given)]
-    forced = [failure.forced(process)] if len(process.sent) > 1 and not run.hurry else []
+    is_forced = any(process.sent[1:]) and not run.hurry
+    forced: list[Event] = [failure.forced(process)] if is_forced else []
     if in_order:
-        return [*forced]
+        return forced
     if run.ending is not None:
         run.deaths += failures
     return [*forced, *map(failure.goes_on, failures)]
@@ -199,8 +203,11 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
         run.came = True
     if given.already and node.base is was and not node.process and not node.planned.run.component:
         node.base = node.level  # it was found so
-    if step is Step.START:
-        _is_there(run, node)
+    process = run.processes.get(node.process)
+    if step is Step.START and process is not None:
+        process.state = ProcessState.RUNNING
+    elif step is Step.START:
+        node.base = Level.DOWN if node.planned.run.component else node.level
     elif step is Step.WIRE:
         node.wired = True
     elif step is Step.DISCONNECT:
@@ -210,14 +217,6 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     if step is Step.DEACTIVATE and node.level < Level.ACTIVE:
         node.let_through = False
     return []
-
-
-def _is_there(run: Run, node: Node) -> None:
-    process = run.processes.get(node.process)
-    if process is None:
-        node.base = Level.DOWN if node.planned.run.component else node.level
-    elif process.state is ProcessState.STARTING:
-        process.state = ProcessState.RUNNING
 
 
 def _step_failed(
@@ -323,11 +322,6 @@ def _broken(run: Run, given: messages.Broken) -> list[Event]:
     return []
 
 
-def _ordered(run: Run, given: messages.Ordered) -> list[Event]:
-    orders.take_order(run, given.order)
-    return []
-
-
 def _changed(run: Run, _: messages.Changed) -> list[Event]:
     run.changed()
     return []
@@ -344,7 +338,7 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     messages.Verified: _verified,
     messages.Programmed: passing.programmed,
     messages.Given: _given,
-    messages.Ordered: _ordered,
+    messages.Ordered: orders.ordered,
     messages.Stop: _stop,
     messages.Silent: _silent,
     messages.Adopted: _adopted,
@@ -430,10 +424,10 @@ def _returned(run: Run) -> list[Event]:
     if run.ending is not None or run.opening is not None:
         return []
     for process in run.processes.values():
-        if process.away_s is None or process.failed or process.state is not ProcessState.RUNNING:
-            continue
         members = [*run.nodes_of(process.name)]
-        if all(each.level >= max(advance.wanted(run, each), Level.STARTED) for each in members):
+        if process.away_s is not None and all(
+            Level.DOWN < advance.wanted(run, each) <= each.level for each in members
+        ):
             events.append(
                 Restarted(
                     process=process.name,

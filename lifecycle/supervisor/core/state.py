@@ -253,7 +253,6 @@ class Process(msgspec.Struct, kw_only=True):
         restarts: how often it was started again after a failure.
         starts: when it was started, by all that its start limit counts.
         in_a_row: its failures without a long run between them.
-        by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
         escalation: what is left of the steps to end it; None before it is asked to end.
@@ -270,7 +269,6 @@ class Process(msgspec.Struct, kw_only=True):
     end: Exited | None = None
     log: str = ""
     sweeping: bool = False
-    by_hand: bool = True
     restarts: int = 0
     starts: list[float] = []
     in_a_row: int = 0
@@ -289,17 +287,14 @@ class Process(msgspec.Struct, kw_only=True):
 
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
-        if self.by_hand:
-            self.starts, self.in_a_row = [], 0
-        self.restarts += self.failed and not self.by_hand
+        self.restarts += self.failed
         # Without a limit they are not counted, and must not pile up.
         kept = self.starts if self.how.start_limit_interval_sec else []
-        self.starts = [*kept, now_s]
-        self.failed = self.by_hand = False
+        self.starts, self.failed = [*kept, now_s], False
 
     def restarted_by_hand(self) -> None:
         """Note that a person starts it again: what failed before is forgotten."""
-        self.by_hand, self.failed = True, False
+        self.starts, self.in_a_row, self.failed = [], 0, False
         self.away_s, self.stays_down = None, False
 
     @property
@@ -565,6 +560,11 @@ class Run(msgspec.Struct, kw_only=True):
         )
 
     @property
+    def is_backing_off(self) -> bool:
+        """Whether a node is to be started again later."""
+        return not all(self.is_past(each.due_s) for each in self.nodes.values())
+
+    @property
     def away(self) -> frozenset[str]:
         """Full names of the nodes that are not as far as their manifest has them."""
         return frozenset(
@@ -642,7 +642,7 @@ class Run(msgspec.Struct, kw_only=True):
     def process_of(self, node: Node) -> Process | None:
         """Return the process that a node is in: a component's is its container's."""
         container = self.nodes.get(node.planned.run.container)
-        name = container.process if container is not None and not node.process else node.process
+        name = node.process if container is None else container.process
         return self.processes.get(name)
 
     def dependents(self, key: str) -> Iterator[Node]:
@@ -697,7 +697,7 @@ class Run(msgspec.Struct, kw_only=True):
 def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None) -> Run:
     """Return a run that begins now; `own`: names of the processes it starts, None for all."""
     run = Run(options=options, plan=plan, first=plan, nodes={}, processes={})
-    run.mode = plan.modes[0].name if plan.modes else ""
+    run.mode = run.mode_by(plan)
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
     run.adopting = options.adopt
