@@ -149,9 +149,9 @@ def _matches(
 
 def _died(run: Run, process: Process | None, pid: int) -> str:
     """Say how a node's process ended without being asked to; empty if it has not."""
-    if process is None or process.end is None or process.asked >= 0 or process.is_over:
+    if process is None or process.end is None or process.escalation is not None or process.is_over:
         return ""
-    if process.by_hand or (run.ending is not None and not process.failures and not run.deaths):
+    if run.ending is not None and not process.failures and not run.deaths:
         return ""
     return f"pid {pid} died: {process.end.text}"
 

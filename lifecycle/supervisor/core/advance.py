@@ -18,6 +18,7 @@ from lifecycle.supervisor.core.state import (
     HOLDS,
     NEVER_S,
     UP,
+    Escalation,
     Level,
     Node,
     Process,
@@ -35,16 +36,9 @@ SIGINT, SIGTERM, SIGKILL = 2, 15, 9
 OWN_S = 0.5
 """Our hosts keep the limits of transitions themselves and know more: they speak first."""
 
-_THEIRS = (Step.CONFIGURE, Step.CONNECT, Step.ACTIVATE, Step.DEACTIVATE)
-
 GLANCE_S = 1.0
-"""For so long a system that is to be no more than connected is judged; it gates nothing."""
-
-NOTICE_S = 0.5
-"""Another supervisor says that it ends before its nodes do, but by another topic than theirs."""
-
-Escalation = tuple[tuple[int, float], ...]
-"""Steps to end a process: (signal number, 0 to close its channel; seconds until the next)."""
+"""More for a run whose time is over, and whose last verdict is not of now or not ok: others may be
+about to say that they end, too."""
 
 HOST: Escalation = ((0, 2.0), (SIGINT, 2.0), (SIGTERM, 1.0), (SIGKILL, NEVER_S))
 """Destroying a participant may hang for good."""
@@ -79,10 +73,9 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
     """Return whether a node is not to be active although the manifest has it so."""
     if node.base is Level.ACTIVE and node.level is Level.ACTIVE:
         return run.paused or bool(node.withheld)  # it is adopted as it was found
-    asked = run.passage is not None and run.passage.lets_go(node.key)
     if run.options.until is not Until.ACTIVE:
         return True
-    if not asked and (run.paused or node.withheld or node.refused):
+    if not _is_let_go(run, node) and (run.paused or node.withheld or node.refused):
         return True
     if node.level is Level.ACTIVE:
         return not node.let_through
@@ -98,6 +91,13 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
         and is_kept_inactive(run, each)
         for each in needs
     )
+
+
+def _is_let_go(run: Run, node: Node) -> bool:
+    """Return whether an order is to let a node through that was kept inactive until now."""
+    change = run.change
+    stays = change is not None and change.back and node.key not in change.active
+    return run.asked is not None and run.asked.until is Until.ACTIVE and not stays
 
 
 def has_reached(run: Run, key: str, condition: Condition | Readiness) -> bool:
@@ -123,7 +123,7 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
         if step <= target and not has_reached(run, after.node, after.condition):
             return _awaited(run, after)
     container = run.nodes.get(node.planned.run.container)
-    if node.planned.run.component and container is not None and container.level < Level.STARTED:
+    if container is not None and container.level < Level.STARTED:
         return f"{container.name} is started"
     if target is Level.CONNECTED and run.wires and not node.wired:
         # What a negotiation asks of a node must not wait for a connection of another.
@@ -160,7 +160,7 @@ def is_walking(run: Run, node: Node) -> bool:
     goal = goal_of(run, node)
     if only_appears(node) and goal:  # it reports nothing: a verdict says whether it is there
         process = run.processes.get(node.process)
-        return bool(node.process) and (process is None or not process.is_alive)
+        return process is not None and not process.is_alive
     return min(goal, node.gate) > node.level or goal < node.may_be_at or node.renew
 
 
@@ -168,14 +168,6 @@ def only_appears(node: Node) -> bool:
     """Return whether all that is known of a node's start is that it is in the graph."""
     run = node.planned.run
     return run.kind is not RunKind.PYTHON and not (node.planned.managed or run.component)
-
-
-def is_awaited(run: Run) -> bool:
-    """Return whether a node of ours that is to be there, and only appears, has not appeared."""
-    return any(
-        each.process and only_appears(each) and each.level < Level.STARTED <= wanted(run, each)
-        for each in run.nodes.values()
-    )
 
 
 def is_at_gate(run: Run) -> bool:
@@ -206,7 +198,7 @@ def advance(run: Run) -> list[messages.Effect]:
         messages.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
     ]
     run.outbox = []
-    if run.adopting and run.ending is None:
+    if run.adopting:
         return found
     for process in run.processes.values():
         found += _process(run, process)
@@ -232,7 +224,7 @@ def _next(run: Run, node: Node) -> Step | None:
     goal = goal_of(run, node)
     if node.level > goal:
         return _step_down(run, node, goal)
-    if node.level < goal and run.fails_s == NEVER_S and run.ending is None:
+    if node.level < goal and not run.failures and run.ending is None:
         return _step_up(run, node)
     return None
 
@@ -242,7 +234,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if node.stuck or (node.silent and target is not Level.STARTED):
         return None
     process = run.processes.get(node.process)
-    if node.process and (process is None or not process.pid or process.asked >= 0):
+    if process is not None and (not process.pid or process.escalation is not None):
         return None
     if holds_up(run, node, target):
         return None
@@ -262,7 +254,7 @@ def _step_down(run: Run, node: Node, goal: Level) -> Step | None:
     asked = can_be_asked(run, node) if goal is Level.DOWN else not node.stuck
     if not asked or _waits_for_dependents(run, node, wanted(run, node)):
         return None
-    if process is not None and (not process.is_alive or process.asked >= 0):
+    if process is not None and process.escalation is not None:
         return None
     if node.level is not Level.STARTED:
         return DOWNWARDS[node.level]
@@ -290,20 +282,19 @@ def _waits_for_dependents(run: Run, node: Node, goal: Level) -> bool:
 def _goes_with_container(run: Run, node: Node) -> bool:
     """Return whether a node is a component whose container's process ends, too."""
     container = run.nodes.get(node.planned.run.container)
-    loaded = node.planned.run.component and container is not None and container.process
-    return bool(loaded) and container is not None and wanted(run, container) is Level.DOWN
+    if container is None or not container.process:
+        return False
+    return wanted(run, container) is Level.DOWN
 
 
 def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
     appears = step is Step.START and only_appears(node) and not node.planned.holds
-    theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
     node.request = Request(
         number=run.requests,
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_of(node.planned, step),
-        own_s=OWN_S if theirs else 0.0,
     )
     if step is Step.ACTIVATE and run.passage is not None:
         run.passage.sent.add(node.key)
@@ -314,7 +305,7 @@ def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
 def late_at_s(request: Request) -> float:
     """Return when a request is late: its process's time without a processor does not count."""
     waited_s = min(request.waited_s, 9 * request.limit_s)
-    return request.since_s + request.limit_s + request.own_s + waited_s
+    return request.since_s + request.limit_s + OWN_S + waited_s
 
 
 # Processes
@@ -344,9 +335,8 @@ def _process(run: Run, process: Process) -> Iterator[messages.Effect]:
 
 def _may_be_spawned(run: Run, process: Process) -> bool:
     members = [*run.nodes_of(process.name)]
-    if run.fails_s < NEVER_S or is_to_end(run, process):
-        return False
-    return not any(holds_up(run, each, Level.STARTED) for each in members)
+    held = any(holds_up(run, each, Level.STARTED) for each in members)
+    return not (run.failures or is_to_end(run, process) or held)
 
 
 def _barks_at_s(run: Run, process: Process) -> float:
@@ -361,21 +351,19 @@ def _barks_at_s(run: Run, process: Process) -> float:
 def _end(run: Run, process: Process) -> Iterator[messages.Signal]:
     """End a process once nothing is left to undo in it, by ever stronger means."""
     members = [*run.nodes_of(process.name)]
-    escalation = _escalation(run, process, members)
-    if process.asked < 0:
+    if process.escalation is None:
         asked = [each for each in members if each.planned.holds and can_be_asked(run, each)]
         busy = any(each.level or each.request is not None for each in asked)
         if busy or any(_waits_for_dependents(run, each, Level.DOWN) for each in members):
             return
-    hurried = run.hurry and SIGKILL not in process.sent
-    if process.asked >= 0 and not hurried and not run.is_past(process.asked_until_s):
+        process.escalation = _escalation(run, process, members)
+    elif run.hurry and SIGKILL not in process.sent:
+        process.escalation = AT_ONCE
+    elif not run.is_past(process.asked_until_s):
         return
-    process.asked = min(process.asked + 1, len(escalation) - 1)
-    if hurried:
-        process.asked = len(escalation) - 1
     process.state = ProcessState.STOPPING
-    number, wait_s = escalation[process.asked]
-    process.asked_until_s = run.now_s + wait_s
+    (number, wait_s), *later = process.escalation
+    process.escalation, process.asked_until_s = tuple(later), run.now_s + wait_s
     run.wakes_at(process.asked_until_s)
     process.sent = [*process.sent, number]
     yield messages.Signal(process=process.name, number=number)
@@ -384,7 +372,7 @@ def _end(run: Run, process: Process) -> Iterator[messages.Signal]:
 def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
     if run.hurry:
         return AT_ONCE
-    if process.state is ProcessState.STARTING or process.sent[:1] == [SIGTERM]:
+    if process.state is ProcessState.STARTING:
         return STARTING
     if process.planned.run.kind is RunKind.COMMAND:
         return COMMAND
@@ -417,12 +405,11 @@ def is_settled_down(run: Run) -> bool:
 def _gate(run: Run) -> Iterator[messages.Effect]:
     if run.ending is not None:
         return
-    judged, passage = run.judged, run.opening
-    programs = passage is not None and passage.flows is None
-    if programs and gate.is_open(run) and passage and judged.verdict:
+    judged, passage, verdict = run.judged, run.opening, run.judged.verdict
+    if passage is not None and passage.flows is None and verdict is not None and gate.is_open(run):
         run.requests += 1
-        passage.programming, passage.flows = run.requests, judged.verdict.flows
-        yield messages.Program(verdict=judged.verdict, number=run.requests)
+        passage.programming, passage.flows = run.requests, verdict.flows
+        yield messages.Program(verdict=verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
     due = not gate.is_latest(run) or run.is_past(judged.again_s)
     if due and not judged.looking and (run.is_watched or is_at_gate(run)):
@@ -441,7 +428,7 @@ def phase_of(run: Run) -> str:
         (run.change is not None, "applying"),
         (run.switch is not None, "switching"),
         (run.opening is not None, "activating"),
-        (run.paused and pausing, "pausing"),
+        (pausing, "pausing"),
         (coming, "restarting" if up else "connecting"),
         (run.asked is not None, "verifying"),
         (run.paused, "paused"),

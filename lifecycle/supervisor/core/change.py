@@ -38,7 +38,7 @@ from lifecycle.supervisor.run.options import Until
 # Modes
 
 
-def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
+def enter_mode(run: Run, mode: str, *, back: bool = False) -> None:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     run.switch, run.to_give = Switch(before=run.mode, back=back), {}
     run.mode, run.plan = mode, in_mode(run.plan, mode)
@@ -47,23 +47,19 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
         if _differs(node.planned, was) and node.level >= Level.STARTED:
             run.to_give[key] = None
     run.changed()
-    return []
 
 
 def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]:
     """Go back to the mode before: a node refuses a parameter, or the gate stays closed."""
     text = f"cannot enter mode {run.mode!r}: back to {before!r}"
     run.passage = None
-    said = [Notice(message=text)]
+    said: list[Event] = [Notice(message=text)]
     if run.order is not None:
         run.undone = code, error
     else:
         said.append(Notice(message=error))
-    events: list[Event] = [*said, *enter_mode(run, before, back=True)]
-    for node in run.nodes.values():
-        if node.is_gated:
-            node.refused = False  # it is let through again as soon as the gate allows it
-    return events
+    enter_mode(run, before, back=True)
+    return said
 
 
 def settle_mode(run: Run) -> list[Event]:
@@ -104,13 +100,12 @@ def apply(run: Run, order: Order) -> list[Event]:
     assert plan is not None
     change = change_to(run, plan)
     if not change.differences:
-        run.answer(ExitCode.OK)
         return []
     known = {each.key for each in plan.nodes}
     failed = {
         key
         for key, each in run.nodes.items()
-        if not run.is_past(each.due_s) or _stays_down(run.process_of(each))
+        if not run.is_past(each.due_s) or _has_failed(run.process_of(each))
     }
     again = {*change.removed, *change.restarted, *(failed & known)}
     down = run.whole(again)
@@ -135,12 +130,10 @@ def apply(run: Run, order: Order) -> list[Event]:
         for key, each in change.parameters.items()
         if key not in down and run.nodes[key].level >= Level.STARTED
     }
-    run.passage = None
-    run.changed()
     return [_said(run, "begun")]
 
 
-def _stays_down(process: Process | None) -> bool:
+def _has_failed(process: Process | None) -> bool:
     return process is not None and process.stays_down and not process.is_over
 
 
@@ -221,9 +214,8 @@ def _take(run: Run, change: Change) -> None:
     change.taken, change.down = True, set()
     run.came = bool(change.touched)
     run.changed()
-    keys = change.active if change.back else None
     until = Until.VERIFIED if run.paused else Until.ACTIVE
-    run.passage = Passage(until_s=change.until_s, until=until, keys=keys)
+    run.passage = Passage(until_s=change.until_s, until=until)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:

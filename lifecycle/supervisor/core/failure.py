@@ -7,6 +7,7 @@ for people, and how a run ends: `end` and the exit code. Pure.
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Iterable
 
 from msgspec.structs import replace
@@ -87,10 +88,11 @@ def doing(run: Run, node: Node) -> str:
 def unfinished(run: Run) -> str:
     """Say what every node is doing, or waits for, that is in a step; empty if none is."""
     found = ((each.name, doing(run, each)) for each in run.nodes.values())
-    said = (
-        (name, text if text.startswith("waits") else f"is still {text}") for name, text in found
+    return "; ".join(
+        f"{name} {'' if text.startswith('waits') else 'is still '}{text}"
+        for name, text in found
+        if text
     )
-    return "; ".join(f"{name} {text}" for name, text in said if not text.endswith("still "))
 
 
 def death(run: Run, process: Process, given: Exited) -> list[Failure]:
@@ -106,7 +108,7 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    barks = process.asked < 0 and bool(process.sent)  # nobody else has sent it anything then
+    barks = process.escalation is None and bool(process.sent)  # it was sent nothing else
     hangs = next((each.hangs for each in members if each.hangs and barks), "")
     after_s = process.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
@@ -127,23 +129,15 @@ def _not_run(process: Process, given: Exited) -> str:
 
 def forced(process: Process) -> Event:
     """Return what is said of a process that did not end when it was asked to."""
-    name = _SIGNALS.get(process.sent[-1], str(process.sent[-1]))
+    name = signal.Signals(process.sent[-1]).name
     return Notice(message=f"process {process.name!r} had to be ended with {name}")
 
 
 def activated(node: Node) -> Event:
     """Return what is said of a node that the gate has not let through, and that is active."""
-    text = f"{node.name!r} {gate.BY_ITSELF}"
-    tries = gate.GUARD_TRIES
-    if node.guarded < tries:
-        return Notice(message=f"{text}: it is deactivated")
-    if node.guarded == tries:
-        in_vain = f"it is deactivated for the last time, after {tries - 1} times in vain"
-        return Notice(message=f"{text}: {in_vain}")
-    return Notice(message=f"{text}: {gate.ACTIVATES_ITSELF}")
-
-
-_SIGNALS = {2: "SIGINT", 9: "SIGKILL", 15: "SIGTERM"}
+    is_guarded = node.guarded <= gate.GUARD_TRIES
+    what = "it is deactivated" if is_guarded else gate.ACTIVATES_ITSELF
+    return Notice(message=f"{node.name!r} {gate.BY_ITSELF}: {what}")
 
 
 def _start_failed(name: str, text: str) -> str:
@@ -217,26 +211,22 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
         return [*events, *fail(run, failure, end)]  # what fails of others counts as ever
     if process is not None and process.failed:
         return []  # it is to be started again for another failure already
-    if _is_covered(process, end):
-        assert process is not None
+    status = None if end is None else end.status
+    if process is not None and is_restarted(process.how, status):
         _cut_short(run, failure)
         return _back_off(run, process, failure, end)
     died = end is not None or failure.rule == PROCESS_DIED.id
     if run.options.keep_going and run.held_s is not None and died:
         if process is not None:
             process.stays_down = True
-        run.judged.counted = run.judged.counted or _named([failure])
         run.deaths.append(failure)
         return [goes_on(failure)]
     if not run.failures:
         run.fails_s = run.now_s + ALSO_S
     # One that says why it cannot go on, and ends, has failed once.
-    dead = failure.process if failure.rule == PROCESS_DIED.id else ""
-    if not any(
-        (each.rule, each.subject) == (failure.rule, failure.subject)
-        or (dead and each.process == dead)
-        for each in run.failures
-    ):
+    ends = failure.rule == PROCESS_DIED.id and failure.process != ""
+    known = {each.process if ends else (each.rule, each.subject) for each in run.failures}
+    if (failure.process if ends else (failure.rule, failure.subject)) not in known:
         run.failures.append(failure)
     return []
 
@@ -254,12 +244,6 @@ def _is_of_change(run: Run, change: Change, failure: Failure, end: Exited | None
     return True
 
 
-def _is_covered(process: Process | None, end: Exited | None) -> bool:
-    if process is None or process.stays_down:
-        return False
-    return is_restarted(process.how, None if end is None else end.status)
-
-
 def goes_on(failure: Failure) -> Failure:
     """Return a failure as one that does not end the run."""
     return replace(failure, ends_run=False)
@@ -267,15 +251,10 @@ def goes_on(failure: Failure) -> Failure:
 
 def _cut_short(run: Run, failure: Failure) -> None:
     """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
-    order = run.order
     run.shut_gate()
-    if order is None or run.change is not None:
-        if run.change is not None:
-            run.change.again = failure.message
-        if run.passage is not None:
-            run.passage.at_gate = False
-            run.passage.until_s = run.now_s + run.timeout_s
-    elif order.ask is not ControlRequest.PAUSE:
+    if run.change is not None:
+        run.change.again = failure.message
+    elif run.order is not None and run.order.ask is not ControlRequest.PAUSE:
         run.passage, run.switch, run.to_give = None, None, {}
         run.answer(ExitCode.BRING_UP_FAILED, failure.message)
 
@@ -297,8 +276,8 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
         node.renew, node.due_s = True, max(node.due_s, due_s)
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
-    if run.passage is not None and run.held_s is None:
-        run.passage.until_s = due_s + run.timeout_s
+    if run.passage is not None:
+        run.passage.at_gate, run.passage.until_s = False, due_s + run.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,
@@ -424,7 +403,7 @@ def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
 def end_done(run: Run) -> list[Event]:
     """End a run that was held for as long as was asked."""
     code, why = _outcome(run, run.judged.counted)
-    if code is ExitCode.OK and run.decided_s is None:
+    if code is ExitCode.OK and run.decided_s is None and gate.has_probation(run):
         code, why = ExitCode.UNVERIFIABLE, "its data were not measured"
     reason = f"done, but {why}" if why else "done"
     return end(run, Ending(code=code, stopping="done", reason=reason))
@@ -447,11 +426,13 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
         code, why = (ExitCode.OK, "") if is_changing else _outcome(run, "")
         if asked in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             code = asked
-        elif code is ExitCode.OK and run.options.hold_s is not None:
+        elif code is not ExitCode.OK:
+            pass  # it was no success before it was asked to end
+        elif run.options.hold_s is not None:
             code, why = asked, f"it did not hold for the {run.options.hold_s:g} s of --stop-after"
-        elif code is ExitCode.OK and run.options.until is Until.ACTIVE and not is_kept:
+        elif not is_kept:
             code, why = asked, f"the system was {phase_of(run)}, not active"
-        elif code is ExitCode.OK and run.judged.counted:
+        elif run.judged.counted:
             why = f"violated meanwhile, {run.judged.counted}"
     said = f"{reason}; {why}" if why else reason
     return end(run, Ending(code=code, stopping=reason, reason=said))
@@ -464,38 +445,27 @@ def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
         return ExitCode.BRING_UP_FAILED, _named(run.deaths)
     if run.options.until is Until.CONNECTED or verdict is None:
         return ExitCode.OK, ""
-    left = follows_from_shut_down(run, verdict)
+    left = _follows_from_shut_down(run, verdict)
     withheld = any(each.withheld for each in run.nodes.values())
     held = (withheld or phase_of(run) == "held") and run.options.until is Until.ACTIVE
     closed = gate.closes(verdict, strict=run.options.strict) and not left
     down = ", ".join(each.name for each in run.processes.values() if each.failed)
+    violated = closed and verdict.verdict is Outcome.VIOLATED
     found = (
-        (closed and verdict.verdict is Outcome.VIOLATED, f"violated; {not_ok(verdict)}"),
-        (bool(meanwhile), f"violated meanwhile, {meanwhile}"),
-        (closed, f"unverifiable; {not_ok(verdict)}"),
-        (held, "held at the gate, and not active"),
-        (bool(down), f"down, and to be started again: {down}"),
+        (violated, ExitCode.VIOLATED, f"violated; {not_ok(verdict)}"),
+        (meanwhile, ExitCode.VIOLATED, f"violated meanwhile, {meanwhile}"),
+        (closed, ExitCode.UNVERIFIABLE, f"unverifiable; {not_ok(verdict)}"),
+        (held, ExitCode.VIOLATED, "held at the gate, and not active"),
+        (down, ExitCode.VIOLATED, f"down, and to be started again: {down}"),
     )
-    why = next((text for holds, text in found if holds), "")
-    unverifiable = ExitCode.UNVERIFIABLE if why.startswith("unver") else ExitCode.VIOLATED
-    return (unverifiable if why else ExitCode.OK), why
+    return next(((code, why) for holds, code, why in found if holds), (ExitCode.OK, ""))
 
 
 def _named(failures: Iterable[Failure]) -> str:
     return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in failures)}"
 
 
-def only_elsewhere(run: Run) -> bool:
-    """Return whether all that is violated is of nodes of supervisors not known to end."""
-    verdict = run.judged.verdict
-    found = () if verdict is None else verdict.findings
-    violated = [each for each in found if each.outcome is Outcome.VIOLATED]
-    names = {run.plan.node(key).full_name for key in run.elsewhere}
-    elsewhere = violated and all(not names.isdisjoint(each.nodes) for each in violated)
-    return bool(elsewhere) and verdict is not None and not follows_from_shut_down(run, verdict)
-
-
-def follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
+def _follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
     """Return whether nothing is violated but the absence of hosts that were shut down properly."""
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     return bool(violated) and all(
@@ -516,25 +486,22 @@ def exit_code_of(run: Run) -> ExitCode:
 
 def fail_late(run: Run, why: str) -> list[Event]:
     """Fail a bring-up, or an order, that takes too long: say what nodes were doing, or why."""
-    busy = [
+    busy = (
         each
         for each in run.nodes.values()
         if each.request is not None and wanted(run, each) is not Level.DOWN
-    ]
-    culprit = busy[0] if busy else None
+    )
+    culprit, change = next(busy, None), run.change
     subject = run.plan.system if culprit is None else culprit.name
+    timeout_s = run.timeout_s if change is None or change.back else change.timeout_s
     why = unfinished(run) or why
-    text = f"cannot bring up {run.plan.system!r} within {run.timeout_s:.3g} s: {why}"
+    text = f"cannot bring up {run.plan.system!r} within {timeout_s:.3g} s: {why}"
     text += next(filter(None, (advice(run, each) for each in run.nodes.values())), "")
-    for node in busy:
-        node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)
     run.shut_gate()
     events = fail(run, _failure(DEADLINE, subject, text, process))
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
-    if run.passage is not None:
-        # What is started again may be due later.
-        again_s = max(run.passage.until_s, run.now_s + run.timeout_s)
-        run.passage.until_s = NEVER_S if run.failures else again_s
+    elif run.passage is not None:  # what is started again may be due later
+        run.passage.until_s = max(run.passage.until_s, run.now_s + run.timeout_s)
     return events

@@ -125,7 +125,7 @@ def refuses_at_s(run: Run, until_s: float) -> float:
         return until_s  # what speaks against it is being mended
     if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
         return run.now_s
-    if not all(run.is_past(each.due_s) for each in run.nodes.values()):
+    if run.is_backing_off:
         return until_s  # what comes again may mend it
     over_s = judged.since_s + patience_s(judged.verdict)
     lasts = is_latest(run) or judged.seen_s >= over_s
@@ -149,7 +149,6 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
     before, judged.verdict = judged.verdict, verdict
-    see_violations(run)
     is_same = before is not None and apart_from_numbers(verdict) == apart_from_numbers(before)
     return None if is_same else verdict
 
@@ -157,7 +156,7 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
 def is_foreign_activation(node: Node) -> bool:
     """Return whether a node is active that the gate has not let through."""
     found = node.level is Level.ACTIVE and node.base < Level.ACTIVE
-    return found and node.planned.managed and node.guarded > 0 and not node.let_through
+    return found and node.guarded > 0 and not node.let_through
 
 
 def _guarded(node: Node) -> Finding:

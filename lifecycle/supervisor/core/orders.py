@@ -15,6 +15,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import advance, failure, gate
 from lifecycle.supervisor.core.change import apply, enter_mode
+from lifecycle.supervisor.core.messages import Ordered
 from lifecycle.supervisor.core.passing import reached
 from lifecycle.supervisor.core.state import Level, Node, Order, Passage, Run
 from lifecycle.supervisor.run.events import ConsequenceTaken, Event
@@ -45,17 +46,11 @@ STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
 """Orders that start processes."""
 
 
-def settled_phase(run: Run) -> str:
-    """Return the phase without what policy does meanwhile, which is nobody's order."""
-    if run.held_s is None or run.ending is not None or run.change is not None:
-        return advance.phase_of(run)
-    return advance.rests_as(run)
-
-
 def refusal(run: Run, order: Order) -> str:
     """Return why an order cannot be carried out now; empty if it can."""
     phases, hint = FITS[order.ask]
-    phase = settled_phase(run)
+    # What policy does meanwhile is nobody's order.
+    phase = advance.phase_of(run) if run.held_s is None else advance.rests_as(run)
     if phase not in phases:
         return f"{_cannot(order, run.plan.system)}: it is {phase}; {hint}"
     return _unfit(run, order)
@@ -111,13 +106,13 @@ def named(run: Run, name: str) -> Node | None:
     return node if ours else None
 
 
-def take_order(run: Run, order: Order) -> list[Event]:
+def ordered(run: Run, given: Ordered) -> list[Event]:
     """Take an order: it is refused at once, carried out, or waits for the one under way."""
-    code, why = refused_at_once(run, order)
+    code, why = refused_at_once(run, given.order)
     if why:
-        run.outbox = [*run.outbox, (order.id, code, why)]
+        run.outbox.append((given.order.id, code, why))
     else:
-        run.orders.append(order)
+        run.orders.append(given.order)
     return []
 
 
@@ -138,15 +133,15 @@ def refused_at_once(run: Run, order: Order) -> tuple[ExitCode, str]:
 def settle_orders(run: Run) -> list[Event]:
     """Be done with the order that is carried out, and begin the next."""
     events: list[Event] = []
-    if run.pauses and _is_done(run):
+    if run.pauses and _is_free(run):
         run.pauses = False
         events.append(reached(run, "paused"))
-    if run.order is not None and _is_done(run):
+    if run.order is not None and _is_free(run):
         run.answer(ExitCode.OK)
     while run.order is None and run.orders and _is_free(run):
         order = run.orders.popleft()
         if why := refusal(run, order):
-            run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
+            run.outbox.append((order.id, ExitCode.USAGE, why))
             continue
         run.order = order
         events += _begin(run, order)
@@ -154,24 +149,21 @@ def settle_orders(run: Run) -> list[Event]:
 
 
 def _is_free(run: Run) -> bool:
-    """Return whether nothing else is under way that an order would have to wait for."""
+    """Return whether nothing is under way that the end of an order, or the next, waits for."""
     busy = run.switch or run.change or run.asked or run.failures
     return not busy and advance.is_settled_down(run)
 
 
-def _is_done(run: Run) -> bool:
-    return _is_free(run) and run.opening is None
-
-
 def _begin(run: Run, order: Order) -> list[Event]:
     """Note an order in the state, by which it is carried out."""
+    run.passage = None
+    run.changed()
     if order.ask is ControlRequest.APPLY:
         return apply(run, order)
-    run.passage = None
     if order.ask is ControlRequest.PAUSE:
         run.paused = run.pauses = True
     elif order.ask is ControlRequest.MODE:
-        return enter_mode(run, order.mode)
+        enter_mode(run, order.mode)
     else:
         if order.ask is ControlRequest.RESTART:
             _restart(run, order)
@@ -180,7 +172,6 @@ def _begin(run: Run, order: Order) -> list[Event]:
         until_s = run.now_s + run.timeout_s
         until = Until.ACTIVE if opens else Until.CONNECTED
         run.passage = Passage(until_s=until_s, until=until)
-    run.changed()
     return []
 
 
@@ -200,7 +191,7 @@ def _restart(run: Run, order: Order) -> None:
     for key in keys:
         each = run.nodes[key]
         each.due_s = 0.0
-        each.renew = each.level > Level.DOWN or bool(each.process)
+        each.renew = True
         process = run.processes.get(each.process)
         if process is not None:
             process.restarted_by_hand()
@@ -244,10 +235,10 @@ def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Reaction | None
 def settle_consequences(run: Run) -> list[Event]:
     """Do about violations that last what the manifest asks for, as a person would order it."""
     verdict = run.judged.verdict
-    busy = run.order or run.asked or run.switch or run.change or run.opening or run.failures
-    if run.held_s is None or run.ending is not None or run.paused or verdict is None:
+    if run.held_s is None or run.paused or verdict is None:
         run.judged.asked = {}
         return []
+    busy = run.order or run.opening or not _is_free(run)
     if busy or run.options.until is not Until.ACTIVE:
         return []
     verdict = gate.of_those_there(run, gate.without(run, verdict, run.away | run.judged.away))
@@ -289,8 +280,8 @@ def _order(
     if what is Consequence.STOP:
         return [said, *failure.stop(run, reason, ExitCode.VIOLATED)]
     if what is Consequence.MODE:
-        return [said, *enter_mode(run, mode)]
-    if what is Consequence.PAUSE:
+        enter_mode(run, mode)
+    elif what is Consequence.PAUSE:
         run.paused = run.pauses = True
         keys = tuple(key for key, each in run.nodes.items() if each.is_gated)
     for key in keys:

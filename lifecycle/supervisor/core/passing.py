@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping
 
-from lifecycle.errors import ExitCode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import advance, failure, gate
@@ -30,7 +29,7 @@ CLOSED = "the verdict keeps the gate closed"
 
 def settle(run: Run) -> list[Event]:
     """Take the passage as far as the state allows."""
-    if run.ending is not None or run.failures:
+    if run.failures:
         return []
     events = [*_come(run), *_arrive(run)]
     if run.opening is not None:
@@ -44,9 +43,10 @@ def _arrive(run: Run) -> list[Event]:
     passage = run.passage
     if passage is None or passage.at_gate:
         return []
-    coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
+    coming = run.held_s is None and run.is_backing_off
     if run.is_changing or coming or not advance.is_at_gate(run):
-        return _late(run, "nothing was started") if run.is_past(passage.until_s) else []
+        is_late = run.is_past(passage.until_s)
+        return failure.fail_late(run, "nothing was started") if is_late else []
     left_s = passage.until_s - run.now_s
     fresh_s = run.timeout_s if run.held_s is not None else run.options.gate_s(left_s)
     if run.change is None:
@@ -80,12 +80,12 @@ def _wait_again(run: Run) -> None:
 
 def _come(run: Run) -> list[Event]:
     """Say that all who came up are at the gate."""
-    coming = any(not run.is_past(each.due_s) or each.renew for each in run.nodes.values())
-    if not run.came or run.is_changing or coming or not advance.is_at_gate(run):
+    if not run.came or run.is_changing or run.is_backing_off or not advance.is_at_gate(run):
         return []
     asked = run.asked
-    waited = asked is not None and asked.at_gate and run.is_past(asked.since_s + gate.SAY_S)
-    if not waited and advance.is_awaited(run):
+    waited = asked is not None and run.is_past(asked.since_s + gate.SAY_S)
+    nodes = [each for each in run.nodes.values() if advance.only_appears(each)]
+    if not waited and any(not each.level and advance.wanted(run, each) for each in nodes):
         return []
     run.came, run.again = False, run.held_s is not None
     return [reached(run, "connected")]
@@ -106,8 +106,9 @@ def _open(run: Run, passage: Passage) -> list[Event]:
     if refuses:
         return _refused(run, again=False)
     # The verdict may allow it, and never be of a moment that lasts.
-    late = run.is_past(passage.until_s + gate.LEAST_S)
-    return _late(run, "it changes all the time") if late else _say_waiting(run, passage)
+    if run.is_past(passage.until_s + gate.LEAST_S):
+        return failure.fail_late(run, "it changes all the time")
+    return _say_waiting(run, passage)
 
 
 def _say_closed(run: Run, passage: Passage) -> list[Event]:
@@ -119,30 +120,18 @@ def _say_closed(run: Run, passage: Passage) -> list[Event]:
     return [Notice(message=gate.refusal(verdict))]
 
 
-def _late(run: Run, why: str) -> list[Event]:
-    """Give up what was to be at the gate, or through it, by now."""
-    change = run.change
-    if change is None or change.back:
-        return failure.fail_late(run, why)
-    why = failure.unfinished(run) or why
-    text = f"cannot bring up {run.plan.system!r} within {change.timeout_s:.3g} s: {why}"
-    return go_back(run, text, ExitCode.BRING_UP_FAILED)
-
-
 def _say_waiting(run: Run, passage: Passage) -> list[Event]:
     verdict = run.judged.verdict
-    if passage.said or verdict is None or not run.is_past(passage.since_s + gate.SAY_S):
+    due_s = passage.since_s + gate.SAY_S
+    if passage.said or verdict is None or gate.allows(run) or not run.is_past(due_s):
         return []
     passage.said = True
-    if gate.allows(run):
-        return []
     left_s = max(0.0, passage.until_s - run.now_s)
     text = f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}"
     return [Notice(message=text)]
 
 
 def _begin(run: Run, passage: Passage) -> None:
-    run.judged.violated = {}
     passage.begun_s, passage.waiting, passage.paused = run.now_s, advance.waiting(run), run.paused
     if not passage.asked:
         passage.until_s = run.now_s + gate.AGAIN_S
@@ -252,14 +241,14 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
     said.append(Notice(message=text))
     if not passage.asked:
         return said
+    if passage.mode:
+        return [*said, *leave_mode(run, passage.mode, text, code)]
     for key in (*keys, *sent):
         # With what is started again by its policy these pass, too.
         run.nodes[key].refused = change is None or not change.again
     if change is not None:
         change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
-    elif passage.mode:
-        return [*said, *leave_mode(run, passage.mode, text, code)]
-    elif run.order is not None:
+    else:
         run.answer(code, text)
     return said
 
@@ -273,8 +262,7 @@ def _became_another(run: Run) -> list[Event]:
         run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
         return [Notice(message=gate.refusal(verdict))]
     if passage.asked:
-        if run.order is not None:
-            run.answer(gate.exit_code(verdict), gate.refusal(verdict))
+        run.answer(gate.exit_code(verdict), gate.refusal(verdict))
         return failure.end_refused(run, verdict, "what became active is not what was verified")
     run.passage = None
     events: list[Event] = []

@@ -41,7 +41,6 @@ from lifecycle.supervisor.core.state import (
     install,
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
-from lifecycle.supervisor.run.options import Until
 from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
 from lifecycle.verify.rules.measured import PROBATION_S
 
@@ -75,15 +74,18 @@ def _settle(run: Run) -> list[Event]:
         events += failure.end_failed(run)
     _give_up_steps(run)
     _begin_anew(run)
-    if run.ending is None:
-        events += settle_mode(run)
-        events += settle_change(run)
-        events += passing.settle(run)
-        events += passing.settle_first_contact(run)
-        events += orders.settle_orders(run)
-        events += orders.settle_consequences(run)
-        events += failure.say_slow(run)
-    if passage is not None and run.passage is None and was_held:
+    for settle in (
+        settle_mode,
+        settle_change,
+        passing.settle,
+        passing.settle_first_contact,
+        orders.settle_orders,
+        orders.settle_consequences,
+        failure.say_slow,
+    ):
+        if run.ending is None:
+            events += settle(run)
+    if passage is not None and run.passage is None and (was_held or gate.has_probation(run)):
         run.changed()  # a look that began on the way through the gate measures nothing
         run.probation = run.mark
         if run.decided_s is None:
@@ -97,9 +99,7 @@ def _settle(run: Run) -> list[Event]:
 
 
 def _spawned(run: Run, given: messages.Spawned) -> list[Event]:
-    process = run.processes.get(given.process)
-    if process is None or process.state is not ProcessState.STARTING:
-        return []
+    process = run.processes[given.process]
     process.log = given.log
     if not given.error:
         process.pid = given.pid or -1
@@ -112,12 +112,10 @@ def _spawned(run: Run, given: messages.Spawned) -> list[Event]:
 
 
 def _exited(run: Run, given: messages.Exited) -> list[Event]:
-    process = run.processes.get(given.process)
-    if process is None or not process.is_alive:
-        return []
+    process = run.processes[given.process]
     failures = failure.death(run, process, given)
     in_order = _ends_in_order(run, process, given)
-    asked = process.asked >= 0
+    asked = process.escalation is not None
     expected = asked or run.ending is not None or advance.is_to_end(run, process)
     process.state, process.end = ProcessState.EXITED, given
     for node in run.nodes.values():
@@ -129,9 +127,10 @@ def _exited(run: Run, given: messages.Exited) -> list[Event]:
         return []
     if not expected:
         return [event for each in failures for event in failure.fail(run, each, given)]
-    forced = [failure.forced(process)] if process.asked > 0 and not run.hurry else []
+    is_forced = any(process.sent[1:]) and not run.hurry
+    forced: list[Event] = [failure.forced(process)] if is_forced else []
     if in_order:
-        return [*forced]
+        return forced
     if run.ending is not None:
         run.deaths += failures
     return [*forced, *map(failure.goes_on, failures)]
@@ -140,7 +139,7 @@ def _exited(run: Run, given: messages.Exited) -> list[Event]:
 def _ends_in_order(run: Run, process: Process, given: messages.Exited) -> bool:
     """Return whether a process that is to end, or was asked to, has not died instead."""
     hosted = process.planned.run.kind is RunKind.PYTHON
-    if process.asked < 0:
+    if process.escalation is None:
         managed = [each for each in run.nodes_of(process.name) if each.planned.managed]
         return given.clean and (not hosted or all(each.level is Level.DOWN for each in managed))
     if given.signal:
@@ -157,11 +156,9 @@ def _is_down(node: Node) -> None:
 
 
 def _swept(run: Run, given: messages.Swept) -> list[Event]:
-    process = run.processes.get(given.process)
-    if process is None or process.state is not ProcessState.EXITED:
-        return []
-    process.state, process.pid, process.asked, process.sent = None, 0, -1, []
-    process.asked_until_s, process.sweeping = NEVER_S, False
+    process = run.processes[given.process]
+    process.state, process.pid, process.escalation, process.sent = None, 0, None, []
+    process.sweeping = False
     run.changed()
     if run.ending is not None or run.change is not None:
         return []
@@ -209,12 +206,13 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
         return _step_failed(run, node, step, error, goal)
     if step in UP.values() and step is not Step.ACTIVATE:
         run.came = True
-    if step in UP.values():
-        node.level = max(given.level, node.after(step))
     if given.already and node.base is was and not node.process and not node.planned.run.component:
         node.base = node.level  # it was found so
-    if step is Step.START:
-        _is_there(run, node)
+    process = run.processes.get(node.process)
+    if step is Step.START and process is not None:
+        process.state = ProcessState.RUNNING
+    elif step is Step.START:
+        node.base = Level.DOWN if node.planned.run.component else node.level
     elif step is Step.WIRE:
         node.wired = True
     elif step is Step.DISCONNECT:
@@ -224,14 +222,6 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     if step is Step.DEACTIVATE and node.level < Level.ACTIVE:
         node.let_through = False
     return []
-
-
-def _is_there(run: Run, node: Node) -> None:
-    process = run.processes.get(node.process)
-    if process is None:
-        node.base = Level.DOWN if node.planned.run.component else node.level
-    elif process.state is ProcessState.STARTING:
-        process.state = ProcessState.RUNNING
 
 
 def _step_failed(run: Run, node: Node, step: Step, error: str, goal: Level) -> list[Event]:
@@ -247,31 +237,20 @@ def _step_failed(run: Run, node: Node, step: Step, error: str, goal: Level) -> l
 
 def _saw(run: Run, given: messages.Saw) -> list[Event]:
     events: list[Event] = []
-    for key, level in given.levels.items():
-        node = run.nodes.get(key)
-        if node is None:
-            continue
+    before = [(each.healthy, each.shown) for each in run.nodes.values()], run.elsewhere, run.left
+    for key, node in run.nodes.items():
+        node.healthy = given.health.get(key, node.healthy)
+        node.shown = given.shown.get(key, node.shown)
+        node.appeared = node.appeared or key in given.appeared
         idle = node.request is None and node.level in (Level.CONFIGURED, Level.CONNECTED)
-        if level is Level.ACTIVE and idle and not node.let_through:
+        if given.levels.get(key) is Level.ACTIVE and idle and not node.let_through:
             run.changed()
             node.level, node.guarded = Level.ACTIVE, node.guarded + 1
             events.append(failure.activated(node))
-    for key, healthy in given.health.items():
-        if key in run.nodes and run.nodes[key].healthy != healthy:
-            run.nodes[key].healthy = healthy
-            run.changed()
-    for key, shown in given.shown.items():
-        if key in run.nodes and run.nodes[key].shown != shown:
-            run.nodes[key].shown = shown
-            run.changed()
-    for key in given.appeared & run.nodes.keys():
-        run.nodes[key].appeared = True
-    for key, conditions in given.elsewhere.items():
-        if run.elsewhere.get(key) != conditions:
-            run.elsewhere = {**run.elsewhere, key: conditions}
-            run.changed()
-    if given.left is not None:
-        run.left = given.left
+    run.elsewhere = {**run.elsewhere, **given.elsewhere}
+    run.left = run.left if given.left is None else given.left
+    now = [(each.healthy, each.shown) for each in run.nodes.values()], run.elsewhere, run.left
+    if now != before:
         run.changed()
     return events
 
@@ -361,7 +340,7 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     messages.Verified: _verified,
     messages.Programmed: passing.programmed,
     messages.Given: _given,
-    messages.Ordered: lambda run, given: orders.take_order(run, given.order),
+    messages.Ordered: orders.ordered,
     messages.Stop: _stop,
     messages.Silent: _silent,
     messages.Adopted: _adopted,
@@ -397,25 +376,18 @@ def _give_up_steps(run: Run) -> None:
 
 def _begin_anew(run: Run) -> None:
     """Let nodes come up again that went down once, with all of their process."""
-    groups: dict[str, list[Node]] = {}
-    for node in run.nodes.values():
-        groups.setdefault(node.process or f"/{node.key}", []).append(node)
-    for name, members in groups.items():
-        process = run.processes.get(name)
-        renewed = [each for each in members if each.renew]
-        if not all(each.is_down for each in renewed) or (process and process.state is not None):
-            continue
-        needs = {after.node for each in renewed for after in each.planned.after}
-        if any(_is_going(run, run.nodes[key]) for key in needs & run.nodes.keys()):
-            continue  # who goes down first comes up last
-        for node in renewed:
+    renewed = [each for each in run.nodes.values() if each.renew]
+    going = {each.key for each in renewed if not each.is_down or _has_process(run, each)}
+    for node in renewed:
+        group = [each for each in renewed if each is node or node.process == each.process != ""]
+        needs = {after.node for each in group for after in each.planned.after}
+        if going.isdisjoint({*needs, *(each.key for each in group)}):  # down first, up last
             node.renew = node.stuck = False
 
 
-def _is_going(run: Run, node: Node) -> bool:
-    """Return whether a node is on its way down to come up again, or its process is."""
+def _has_process(run: Run, node: Node) -> bool:
     process = run.processes.get(node.process)
-    return node.renew and (not node.is_down or (process is not None and process.state is not None))
+    return process is not None and process.state is not None
 
 
 def _hold(run: Run) -> list[Event]:
@@ -423,18 +395,14 @@ def _hold(run: Run) -> list[Event]:
     if run.held_s is None:
         if run.passage is None and not run.failures and run.furthest:
             run.held_s = run.measures_s = run.now_s
-            if not gate.has_probation(run):
-                run.decided_s = run.held_s
-            else:
-                run.changed()  # a look that began before it was up measures nothing
-                run.probation = run.mark
         return []
     said: list[Event] = []
     since_s = run.decided_s
     if since_s is None:
         if gate.is_measuring(run):
             return []
-        if gate.is_unsettled(run):  # its data are measured once it is whole again
+        if gate.has_probation(run) and gate.is_unsettled(run):
+            # Its data are measured once it is whole again.
             since_s = run.measures_s + PROBATION_S
         else:
             since_s = run.decided_s = run.now_s
@@ -443,13 +411,7 @@ def _hold(run: Run) -> list[Event]:
     over_s = NEVER_S if hold_s is None else since_s + hold_s
     if not run.is_past(over_s) or run.order is not None or run.failures:
         return said
-    waits = not gate.is_latest(run) and any(
-        each.level is Level.ACTIVE for each in run.nodes.values()
-    )
-    if failure.only_elsewhere(run) and not run.is_past(over_s + advance.NOTICE_S):
-        return said  # who runs these may be about to say that it ends, too
-    if run.options.until is Until.CONNECTED:
-        waits = not (gate.allows(run) and gate.is_latest(run))
+    waits = not (gate.is_latest(run) and gate.allows(run))
     if waits and not run.is_past(over_s + advance.GLANCE_S):
         return said
     return [*said, *failure.end_done(run)]
@@ -470,10 +432,10 @@ def _returned(run: Run) -> list[Event]:
     if run.ending is not None or run.opening is not None:
         return []
     for process in run.processes.values():
-        if process.away_s is None or process.failed or process.state is not ProcessState.RUNNING:
-            continue
         members = [*run.nodes_of(process.name)]
-        if all(each.level >= max(advance.wanted(run, each), Level.STARTED) for each in members):
+        if process.away_s is not None and all(
+            Level.DOWN < advance.wanted(run, each) <= each.level for each in members
+        ):
             events.append(
                 Restarted(
                     process=process.name,

@@ -126,7 +126,7 @@ class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
     Attributes:
-        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
+        limit_s: that the manifest sets.
         waited_s: of the time since, without CPU: it does not count.
         said: it was said that it takes long.
     """
@@ -135,7 +135,6 @@ class Request(msgspec.Struct, kw_only=True):
     step: Step
     since_s: float
     limit_s: float
-    own_s: float = 0.0
     waited_s: float = 0.0
     said: bool = False
 
@@ -238,6 +237,10 @@ class Node(msgspec.Struct, kw_only=True):
         return Level.STARTED if is_plain else REACHES[step]
 
 
+Escalation = tuple[tuple[int, float], ...]
+"""Steps to end a process: (signal number, 0 to close its channel; seconds until the next)."""
+
+
 class Process(msgspec.Struct, kw_only=True):
     """One process that this supervisor starts.
 
@@ -250,10 +253,9 @@ class Process(msgspec.Struct, kw_only=True):
         restarts: how often it was started again after a failure.
         starts: when it was started, by all that its start limit counts.
         in_a_row: its failures without a long run between them.
-        by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
-        asked: index of the step of its escalation that was taken last; -1 before.
+        escalation: what is left of the steps to end it; None before it is asked to end.
         asked_until_s: then the next one is taken.
         sent: signals that it was sent.
         stays_down: it is not started again: it ended as it may, or the run goes on without it.
@@ -267,14 +269,13 @@ class Process(msgspec.Struct, kw_only=True):
     end: Exited | None = None
     log: str = ""
     sweeping: bool = False
-    by_hand: bool = True
     restarts: int = 0
     starts: list[float] = []
     in_a_row: int = 0
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
-    asked: int = -1
+    escalation: Escalation | None = None
     asked_until_s: float = NEVER_S
     sent: list[int] = []
     stays_down: bool = False
@@ -286,17 +287,14 @@ class Process(msgspec.Struct, kw_only=True):
 
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
-        if self.by_hand:
-            self.starts, self.in_a_row = [], 0
-        self.restarts += self.failed and not self.by_hand
+        self.restarts += self.failed
         # Without a limit they are not counted, and must not pile up.
         kept = self.starts if self.how.start_limit_interval_sec else []
-        self.starts = [*kept, now_s]
-        self.failed = self.by_hand = False
+        self.starts, self.failed = [*kept, now_s], False
 
     def restarted_by_hand(self) -> None:
         """Note that a person starts it again: what failed before is forgotten."""
-        self.by_hand, self.failed = True, False
+        self.starts, self.in_a_row, self.failed = [], 0, False
         self.away_s, self.stays_down = None, False
 
     @property
@@ -335,7 +333,6 @@ class Passage(msgspec.Struct, kw_only=True):
         asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
         until: CONNECTED: they are only to come to the gate, VERIFIED: it is only judged, ACTIVE: it
             lets them through.
-        keys: of those that are, also where an order or a consequence kept them; None for all.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
         at_gate: the nodes have come as far.
         tries: nodes that were started again at it, by full name, and how often.
@@ -352,7 +349,6 @@ class Passage(msgspec.Struct, kw_only=True):
     until_s: float
     asked: bool = True
     until: Until = Until.ACTIVE
-    keys: frozenset[str] | None = None
     mode: str = ""
     at_gate: bool = False
     tries: Counter[str] = msgspec.field(default_factory=Counter)
@@ -371,11 +367,6 @@ class Passage(msgspec.Struct, kw_only=True):
     def is_programmed(self) -> bool:
         """Whether networks have the flows."""
         return self.flows is not None and not self.programming
-
-    def lets_go(self, key: str) -> bool:
-        """Return whether a node is to be let through that was kept inactive until now."""
-        opens = self.asked and self.until is Until.ACTIVE
-        return opens and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
@@ -571,6 +562,11 @@ class Run(msgspec.Struct, kw_only=True):
         )
 
     @property
+    def is_backing_off(self) -> bool:
+        """Whether a node is to be started again later."""
+        return not all(self.is_past(each.due_s) for each in self.nodes.values())
+
+    @property
     def away(self) -> frozenset[str]:
         """Full names of the nodes that are not as far as their manifest has them."""
         return frozenset(
@@ -648,7 +644,7 @@ class Run(msgspec.Struct, kw_only=True):
     def process_of(self, node: Node) -> Process | None:
         """Return the process that a node is in: a component's is its container's."""
         container = self.nodes.get(node.planned.run.container)
-        name = container.process if container is not None and not node.process else node.process
+        name = node.process if container is None else container.process
         return self.processes.get(name)
 
     def dependents(self, key: str) -> Iterator[Node]:
@@ -664,7 +660,7 @@ class Run(msgspec.Struct, kw_only=True):
         """Answer the order that is carried out, and be done with it."""
         if self.order is not None:
             code, error = self.undone or (code, error)
-            self.outbox = [*self.outbox, (self.order.id, code, error)]
+            self.outbox.append((self.order.id, code, error))
         self.order, self.undone = None, None
 
     def fails_now(self, *failures: Failure) -> None:
@@ -703,7 +699,7 @@ class Run(msgspec.Struct, kw_only=True):
 def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None) -> Run:
     """Return a run that begins now; `own`: names of the processes it starts, None for all."""
     run = Run(options=options, plan=plan, first=plan, nodes={}, processes={})
-    run.mode = plan.modes[0].name if plan.modes else ""
+    run.mode = run.mode_by(plan)
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
     run.adopting = options.adopt

@@ -15,7 +15,7 @@ from lifecycle.manifest.model import Condition, Mode, RunKind
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, look, order
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, check, follow
 from lifecycle.supervisor.core.orders import FITS, refusal
-from lifecycle.supervisor.core.state import Ending, Order, new_run
+from lifecycle.supervisor.core.state import Order, new_run
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import Observation
 from tests.builders import HERE, plan_of, planned_node
@@ -30,14 +30,12 @@ PLAN = plan_of(
 
 
 @pytest.mark.parametrize("ask", FITS)
-@pytest.mark.parametrize("phase", ["active", "paused", "held", "connecting", "stopping"])
+@pytest.mark.parametrize("phase", ["active", "paused", "held", "connecting"])
 def test_an_order_fits_some_phases_and_no_others(ask: ControlRequest, phase: str) -> None:
     run = new_run(PLAN, UpOptions())
     run.held_s, run.passage = (None if phase == "connecting" else 0.0), None
     run.paused = phase == "paused"
     run.nodes["camera"].refused = phase == "held"
-    if phase == "stopping":
-        run.ending = Ending(code=ExitCode.OK, stopping="done", reason="done")
     why = refusal(run, Order(id=0, ask=ask))
     fits = phase in FITS[ask][0]
     what = {ControlRequest.MODE: "switch the mode of", ControlRequest.APPLY: "apply another"}

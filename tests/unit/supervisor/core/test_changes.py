@@ -13,11 +13,13 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Mode,
     ModeParameter,
+    OnFailure,
     OnViolation,
     ParameterDeclaration,
     Policy,
     Reaction,
     Restart,
+    RunKind,
     Supervision,
 )
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode, in_mode
@@ -261,6 +263,19 @@ def test_an_end_in_the_middle_takes_down_what_is_there(stage: str) -> None:
     assert play.answers[0] == (6, "cannot go on: 'robot' is being taken down")
     play.wait(60.0)
     assert (play.code, play.reason) == (6, f"lifecycle down; the system was {phase}, not active")
+
+
+def test_a_node_of_others_that_a_manifest_leaves_out_is_left_once_its_step_is_done() -> None:
+    base = planned_node("base", kind=RunKind.ATTACH)
+    camera = replace(CAMERA, supervision=replace(AGAIN, on_failure=OnFailure.ALL))
+    play = Play(plan_of(camera, base))
+    play.ways["base configure"] = "hang"
+    play.die("camera")
+    play.wait(1.0)
+    play.order(APPLY, plan=plan_of(camera))
+    assert play.answers == {}
+    assert play.finish("base configure")[0] == "base cleanup"
+    assert play.answers[0][0] == 0
 
 
 def test_what_waits_at_its_gate_is_let_through_by_a_manifest_or_waits_on() -> None:

@@ -204,6 +204,13 @@ def test_no_node_is_wired_before_those_are_configured_that_come_early() -> None:
     assert "a wire" in play.finish("b configure")
 
 
+def test_a_node_of_others_that_was_disconnected_is_wired_anew() -> None:
+    plan = plan_of(planned_node("a", kind=RunKind.ATTACH), planned_node("b"))
+    wired = replace(plan.data_layer, authority=Authority.SUPERVISOR)
+    play = Play(replace(plan, data_layer=wired))
+    assert play.order(ControlRequest.RESTART).count("a wire") == 1
+
+
 def test_what_goes_down_with_two_that_failed_is_started_again_after_the_longer_time() -> None:
     alone = Supervision(restart=Restart.ON_FAILURE, restart_sec=5.0)
     every = replace(alone, restart_sec=1.0, on_failure=OnFailure.ALL)

@@ -6,13 +6,13 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, Discovery, RunKind, Timeouts
+from lifecycle.manifest.model import Condition, Discovery, OnFailure, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.failure import ALSO_S
 from lifecycle.supervisor.run.events import Failure, Notice, RestartScheduled
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.core.playbook import CHAIN, GONE, INTRUDER, Play, chain
+from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, GONE, INTRUDER, Play, chain
 from tests.unit.supervisor.session_world import DIALLING
 
 CHANGED = "the system changed before every node was activated"
@@ -46,6 +46,20 @@ def test_a_condition_holds_the_step_that_it_names_and_none_before(
 def test_a_node_waits_until_another_is_healthy() -> None:
     plan = plan_of(planned_node("a"), planned_node("b", after={"a": Condition.HEALTHY}))
     play = Play(plan)
+    assert play.levels == "4 3"
+    play.give(messages.Saw(health={"a": True}))
+    assert play.levels == "4 4"
+
+
+def test_a_node_that_died_is_healthy_once_it_says_so_again() -> None:
+    plan = plan_of(
+        planned_node("a", supervision=replace(AGAIN, on_failure=OnFailure.DEPENDENTS)),
+        planned_node("b", after={"a": Condition.HEALTHY}),
+    )
+    play = Play(plan)
+    play.give(messages.Saw(health={"a": True}))
+    play.die("a")
+    play.wait(5.0)
     assert play.levels == "4 3"
     play.give(messages.Saw(health={"a": True}))
     assert play.levels == "4 4"
@@ -85,7 +99,7 @@ def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_m
     mends = "if it is a plain node, write 'managed: false' at nodes.driver"
     said = f"'/driver' is still {waits}, for up to 8 s more; {mends}"
     assert [each.message for each in play.heard(Notice)] == [said]
-    play.wait(8.0)
+    play.wait(8.5)
     late = f"cannot bring up '/driver': it was still {waits} after 10 s; {mends}"
     assert play.failures == [("/driver", late)]
 
@@ -139,6 +153,13 @@ def test_a_lone_failure_waits_for_nobody_who_is_not_in_a_step() -> None:
     play = Play(plan, ways={"a connect": "no network"})
     assert play.failures == [("/a", "no network")]
     assert play.run.ending is not None
+
+
+def test_nodes_of_others_that_fail_side_by_side_are_all_named() -> None:
+    ways = {"a configure": "hang", "b configure": "no arm"}
+    play = Play(plan_of(*(planned_node(key, kind=RunKind.ATTACH) for key in "ab")), ways=ways)
+    play.finish("a configure", error="no leg")
+    assert play.failures == [("/b", "no arm"), ("/a", "no leg")]
 
 
 def test_processes_that_die_one_after_the_other_are_all_named() -> None:
@@ -343,3 +364,7 @@ def test_an_interrupt_and_what_cuts_a_run_short_that_is_bound_to_stay_are_no_suc
     play.give(messages.Stop(reason="terminated", code=ExitCode.TERMINATED))
     why = "terminated; it did not hold for the 10 s of --stop-after"
     assert (play.code, play.reason) == (143, why)
+    play = Play(CHAIN, stop_after_s=10.0)
+    play.see(INTRUDER)
+    play.stop("terminated", ExitCode.TERMINATED)
+    assert (play.code, play.reason[:20]) == (4, "terminated; violated")

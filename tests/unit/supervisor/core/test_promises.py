@@ -60,7 +60,7 @@ MUTANTS = [
     ("order", "advance.py", "condition in node.shown and ", ""),
     ("order", "reduce.py", "    node.shown = frozenset()\n\n", "\n"),
     ("order", "advance.py", "    return not run.hurry and any(", "    return False and any("),
-    ("ends", "advance.py", "process.asked = min(process.asked + 1, ", "process.asked = min(0, "),
+    ("ends", "advance.py", "tuple(later), run.now_s", "process.escalation, run.now_s"),
     ("ends", "advance.py", "    run.wakes_at(process.asked_until_s)\n", ""),
     (
         "ends",
@@ -68,7 +68,7 @@ MUTANTS = [
         "        if node.request is not None and at_s >= advance.late_at_s",
         "        if False and late_at_s",
     ),
-    ("processes", "advance.py", " or is_to_end(run, process):", ":"),
+    ("processes", "advance.py", " or is_to_end(run, process) or held", " or held"),
     (
         "processes",
         "reduce.py",

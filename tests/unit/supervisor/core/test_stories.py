@@ -110,6 +110,13 @@ def test_a_node_that_is_not_as_it_was_verified_is_verified_again() -> None:
     assert play.levels == "4"
 
 
+def test_a_node_that_was_not_activated_as_things_changed_is_nobody_elses_to_activate() -> None:
+    ways = {"camera activate": "changed", "look": "hang"}
+    play = Play(plan_of(planned_node("camera")), ways=ways)
+    play.give(messages.Verified(mark=play.held.pop().mark, verdict=play.found))
+    assert play.give(messages.Saw(levels={"camera": Level.ACTIVE})) == ["camera deactivate"]
+
+
 def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
     run = new_run(CHAIN, UpOptions(timeout_s=2.0))
     take(run, 0.0, messages.Tick())
@@ -193,6 +200,12 @@ def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
     play.give(messages.Saw(left=frozenset({"/camera"})))
     play.wait(6.0)
     assert play.code == 0
+    for other in (("graph.missing-node", "/viewer"), INTRUDER):
+        play = Play(CHAIN, stop_after_s=5.0)
+        play.see(GONE, other)
+        play.give(messages.Saw(left=frozenset({"/camera"})))
+        play.wait(7.0)
+        assert play.code == 4
 
 
 # Failures
@@ -527,3 +540,10 @@ def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code
     assert play.levels == "4 4"
     play.wait(30.0)
     assert play.code == ExitCode.VIOLATED
+
+
+def test_an_order_to_a_system_that_is_taken_down_is_refused_at_once() -> None:
+    play = Play(CHAIN, ways={"viewer deactivate": "hang"})
+    play.down()
+    play.order(ControlRequest.PAUSE)
+    assert play.answers[0] == (6, "cannot go on: 'robot' is being taken down")
