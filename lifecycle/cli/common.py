@@ -268,7 +268,16 @@ def target_arguments(function: F) -> F:
 def target_argument(function: F) -> F:
     """Add `TARGET`: a manifest, or a running system."""
     complete = completing("manifests systems")
-    return click.argument("target", metavar="TARGET", shell_complete=complete)(function)
+    return click.argument("target", metavar="TARGET", type=_Target(), shell_complete=complete)(
+        function
+    )
+
+
+class _Target(click.types.StringParamType):
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Name what may be meant, where no target is given."""
+        del param, ctx
+        return f"It is a manifest, or a system; running: {', '.join(_systems()) or 'none'}"
 
 
 def machine_option(help_: str) -> Callable[[F], F]:
@@ -467,7 +476,7 @@ def _manifests(_: click.Context) -> Iterable[str]:
     return sorted(each.name for each in Path().glob("*.lifecycle.yaml"))
 
 
-def _systems(_: click.Context) -> Iterable[str]:
+def _systems(_: click.Context | None = None) -> list[str]:
     from lifecycle.run_directory import run_roots, running
 
     return [each.name for each in running(*run_roots(os.environ))]

@@ -264,6 +264,8 @@ def _saw(run: Run, given: messages.Saw) -> list[Event]:
             run.changed()
     for key in given.appeared & run.nodes.keys():
         run.nodes[key].appeared = True
+    if given.undeclared is not None:
+        run.undeclared = given.undeclared
     for key, conditions in given.elsewhere.items():
         if run.elsewhere.get(key) != conditions:
             run.elsewhere = {**run.elsewhere, key: conditions}

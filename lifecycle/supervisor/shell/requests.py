@@ -263,8 +263,13 @@ class Requests:
         """Wait until discovery shows a node of this name; the core sets the limit."""
         while True:
             changed = self._shell.changed
-            if await self._shell.is_seen(name):
+            seen = await self._shell.seen()
+            if name in seen:
                 return
+            declared = {each.full_name for each in self._system.plan.nodes}
+            undeclared = frozenset(each for each in seen - declared if "/_" not in each)
+            if undeclared != self._system.run.undeclared:
+                self._shell.give(messages.Saw(undeclared=undeclared))
             await set_within(changed, None)
 
     def _check_alone(self, node: NodeRun) -> None:
