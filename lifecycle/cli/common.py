@@ -67,7 +67,8 @@ def _installed(package: str, name: str) -> str:
     prefixes = search_prefixes()
     index = None if "/" in package else find_resource("packages", package, prefixes)
     if index is None:
-        hint = did_you_mean(package, list_resources("packages", prefixes))
+        near = did_you_mean(package, list_resources("packages", prefixes))
+        hint = near or "source the setup file of the package's workspace"
         raise UsageError(f"cannot find a file or a package {package!r}", hint=hint)
     share = index.parents[3] / package  # of PREFIX/share/ament_index/resource_index/packages/NAME
     found = sorted(share.rglob("*.yaml"))
