@@ -52,7 +52,7 @@ def suggestion(value: ParameterValue, declared: str) -> str:
     if declared == "double" and isinstance(value, int) and not isinstance(value, bool):
         return f"write {float(value)}"
     if declared in _NUMBERS and isinstance(value, str) and _NUMBERS[declared].fullmatch(value):
-        return f"write {value}, without quotes"
+        return f"write {value} as a number, not as text"
     if declared == "string" and not isinstance(value, (str, tuple)):
         return "put it in quotes"
     if declared == "double_array" and type_of(value) == "int_array" and isinstance(value, tuple):
