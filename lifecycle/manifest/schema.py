@@ -381,7 +381,7 @@ def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
         hint = _number(value, _name(each), each.schema)
     elif types == ["object"] and value is None:
         hint = "indent below it what belongs to it"
-    elif _name(each) == "qos" and isinstance(value, int):
+    elif _name(each) == "qos" and type(value) is int:
         hint = f"write {{depth: {value}}}"
     elif types == ["object"]:
         key = next(iter((*each.schema.get("required", ()), *_known(each), _NAME)))
