@@ -28,6 +28,9 @@ import pytest
 if TYPE_CHECKING:
     from lifecycle.node.host.in_process import NodeInProcess
 
+__tracebackhide__ = True
+"""pytest shows the line of the test that failed, and no frame of this module."""
+
 DOMAINS = (*range(215, 232), *range(70, 102))
 """Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be."""
 
@@ -325,11 +328,15 @@ def lifecycle_node(
             arguments: Mapping[str, object] | None = None,
             to: str = "active",
         ) -> NodeInProcess:
+            from lifecycle.manifest.diagnostics import ManifestError
             from lifecycle.manifest.loading import load
             from lifecycle.plan.build import build_plan, find_node
 
             given = {name: str(value) for name, value in (arguments or {}).items()}
-            loaded = load(os.fspath(manifest), given)
+            try:
+                loaded = load(os.fspath(manifest), given)
+            except ManifestError as error:
+                raise error.with_traceback(None) from None
             plan = build_plan(loaded.manifest, domain_id=lifecycle_domain)
             planned = find_node(plan, node)
             for name, value in (("ROS_LOG_DIR", str(tmp_path)), *planned.run.environment):

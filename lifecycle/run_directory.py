@@ -492,7 +492,7 @@ def find_run(roots: Iterable[Path], word: str) -> Path:
     raise UsageError(
         f"cannot find a running system {word!r}; "
         f"running: {', '.join(each.name for each in runs) or 'none'}",
-        hint="start it: lifecycle up MANIFEST",
+        hint="" if runs else "start it: lifecycle up MANIFEST",
     )
 
 

@@ -62,7 +62,8 @@ def _of_package(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) 
     prefixes = search_prefixes()
     index = None if "/" in package else find_resource("packages", package, prefixes)
     if index is None:
-        hint = did_you_mean(package, list_resources("packages", prefixes))
+        near = did_you_mean(package, list_resources("packages", prefixes))
+        hint = near or "source the setup file of the package's workspace"
         raise UsageError(f"cannot find a file or a package {package!r}", hint=hint)
     share = index.parents[3] / package  # of PREFIX/share/ament_index/resource_index/packages/NAME
     found = sorted(share.rglob("*.yaml"))
@@ -269,7 +270,16 @@ def target_arguments(function: F) -> F:
 def target_argument(function: F) -> F:
     """Add `TARGET`: a manifest, or a running system."""
     complete = completing("manifests systems")
-    return click.argument("target", metavar="TARGET", shell_complete=complete)(function)
+    return click.argument("target", metavar="TARGET", type=_Target(), shell_complete=complete)(
+        function
+    )
+
+
+class _Target(click.types.StringParamType):
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Name what may be meant, where no target is given."""
+        del param, ctx
+        return f"It is a manifest, or a system; running: {', '.join(_systems()) or 'none'}"
 
 
 def machine_option(help_: str) -> Callable[[F], F]:
@@ -434,14 +444,18 @@ def completing(what: str) -> Callable[[click.Context, click.Parameter, str], lis
     return complete
 
 
+def _systems() -> list[str]:
+    from lifecycle.run_directory import run_roots, running
+
+    return [each.name for each in running(*run_roots(os.environ))]
+
+
 def _words(kind: str, context: click.Context) -> list[str]:
     """Return "manifests" and "systems" here, "runs", or what the manifest before has of a kind."""
     if kind == "manifests":
         return sorted(each.name for each in Path().glob("*.lifecycle.yaml"))
     if kind == "systems":
-        from lifecycle.run_directory import run_roots, running
-
-        return [each.name for each in running(*run_roots(os.environ))]
+        return _systems()
     if kind == "runs":
         from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
 

@@ -20,7 +20,7 @@ from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.judge import missing, not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text, to_json
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.verdict import FindingKey, Stage, Verdict
 
 _AGAIN_S = 1.0
 
@@ -121,6 +121,7 @@ class PlainLines:
         self._width = width
         self._narrator = Narrator()
         self._judged: str | None = None
+        self._waited: set[FindingKey] = set()
         self._active = False
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
@@ -139,6 +140,9 @@ class PlainLines:
             if line == self._judged:
                 return
             self._judged = line
+            waited, self._waited = self._waited, {each.key for each in event.verdict.findings}
+            if event.stage is Stage.CONNECTED and self._waited < waited and missing(event.verdict):
+                return  # it gets on: less of what was said is missing
         if line is not None:
             self._put(line + "\n", kept=not isinstance(event, events.LogLine))
 

@@ -60,6 +60,7 @@ class Deployment(msgspec.Struct, frozen=True, kw_only=True):
         timeout_s: of the whole bring-up, where `words` set one; 0 for none.
         image: of containers; has the programs of all nodes.
         program: path of `lifecycle`; in containers it is found by name.
+        folder: where `lifecycle up` is started, and looks for relative programs; "/" if empty.
         programs_networks: it is told to program networks, which takes CAP_NET_ADMIN.
     """
 
@@ -69,6 +70,7 @@ class Deployment(msgspec.Struct, frozen=True, kw_only=True):
     timeout_s: float = 0.0
     image: str = ""
     program: str = "/opt/lifecycle/bin/lifecycle"
+    folder: str = ""
     programs_networks: bool = False
 
     @property
@@ -153,11 +155,13 @@ def systemd(deployment: Deployment) -> dict[str, str]:
 
 def _systemd_unit(deployment: Deployment, machine: str) -> str:
     name, restarts = deployment.name(machine), deployment.restarts(machine)
+    folder = deployment.folder
     allowed = "CAP_NET_ADMIN" if deployment.programs_networks else ""
     service: list[tuple[str, object]] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),
         ("ExecStart", _command((deployment.program, *deployment.arguments(machine)))),
+        *([("WorkingDirectory", folder.replace("%", "%%"))] if folder else []),
         ("TimeoutStartSec", deployment.start_s),
         ("TimeoutStopSec", deployment.stop_s),
         # SIGTERM to the supervisor alone, which takes its nodes down in order.

@@ -126,7 +126,7 @@ SUFFIX = ".nodl.yaml"
 _Spell = Callable[[Scalar], Scalar]
 _WIDTH = 100
 _ANNOUNCED = "history and depth are not announced"
-_NOW = "its value now; the default is not told"
+_NOW = "its value now; the default is not known"
 _SERVICES = "the graph does not show the QoS of services"
 _UNKNOWN_POLICY = "SYSTEM_DEFAULT"
 
@@ -149,7 +149,7 @@ def to_manifest(
         f"# yaml-language-server: $schema={schema}",
         *_comments(
             f"Captured from domain {system.domain_id}, discovery range "
-            f"{system.discovery_range.value}. What a graph does not tell is marked: gap."
+            f"{system.discovery_range.value}. What a graph does not show is marked: gap."
         ),
         *(line for each in _gaps(system) for line in _comments(f"gap: {each}")),
     ]
@@ -176,7 +176,7 @@ def _gaps(system: CapturedSystem) -> Iterable[str]:
     foreign = [each.full_name for each in system.nodes if not each.has_configuration]
     if foreign:
         yield (
-            "not ours, so that machine, process, flows, DSCP, history and depth are not told: "
+            "not ours, so that machine, process, flows, DSCP, history and depth are unknown: "
             + ", ".join(foreign)
         )
         yield "remaps cannot be seen: names are those in the graph, not those in the nodes' code"
@@ -188,7 +188,7 @@ def kept(keys: Mapping[str, Tree | None]) -> dict[str, Tree]:
 
 
 def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str, Tree]:
-    unknown = Noted(value={}, note="gap: its address is not told")
+    unknown = Noted(value={}, note="gap: its address is unknown")
     ends = {(each.kind, each.name) for node in system.nodes for each in node.endpoints}
     waiting = {
         name for kind, name in ends if not kind.offers and (kind.other_end, name) not in ends

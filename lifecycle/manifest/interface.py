@@ -72,7 +72,7 @@ def build_inline(interface: Document, found: Findings) -> Interface:
                 endpoints.append(_endpoint(kind, each, found))
             else:
                 message = f"cannot declare {quote(each.text('name'))} twice among {kind.value}"
-                hint = f"the first stands at {other.at().spelled}"
+                hint = f"the first is at {other.at().spelled}"
                 at = each.at(("name",))
                 found.append(error("manifest.duplicate-name", at, message, hint))
     parameters = (_declaration(name, each, found) for name, each in interface.entries("parameters"))
@@ -359,7 +359,7 @@ class _NodlReading:
             other = first.setdefault((what, name), at)
             if other is not at:
                 place = f"{other.spelled}"
-                message = f"cannot declare {what} {name!r} twice; the first stands at {place}"
+                message = f"cannot declare {what} {name!r} twice; the first is at {place}"
                 self._error("duplicate", at, message, "remove one")
 
     def _locate(self, reference: str, base: Path, at: Position) -> Path | None:

@@ -154,6 +154,19 @@ def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
     )
 
 
+def _other_kind(document: Document) -> tuple[str, str] | None:
+    """Return which other document of ROS 2 this is, and what takes it; None for a manifest."""
+    if "manifest_version" in document:
+        return None
+    if "launch" in document:
+        return "a launch file", f"write a manifest from it: lifecycle import {document.file}"
+    if "nodl_version" in document:
+        return "a NoDL document", "a node names it: 'interface: local://PATH'"
+    if any("ros__parameters" in each for _, each in document.entries()):
+        return "a parameter file", "a node names it: 'parameter_files: [PATH]'"
+    return None
+
+
 def _without_left_out(manifest: Manifest) -> Manifest:
     """Return a manifest whose nodes wait for no node that is left out, and links have both ends."""
     there = {node.key for node in manifest.nodes}
@@ -262,6 +275,11 @@ class _Loading:
         except ManifestError as problem:
             self.found += problem.diagnostics
             return
+        if kind := _other_kind(document):
+            what, hint = kind
+            message = f"cannot use {what} as a manifest"
+            self.found.append(error("manifest.kind", document.at(), message, hint))
+            return
         self._check_suffix(document)
         before = len(self.found)
         surroundings = Surroundings(
@@ -359,7 +377,7 @@ class _Loading:
         address = canonical(part.text("address"))
         if address and parse_address(address) is None:
             message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
-            hint = "look the name up: a plan must not depend on a name server"
+            hint = "" if address[-1].isdigit() else "look the name up: a plan asks no name server"
             self.found.append(error("manifest.address", part.at(("address",)), message, hint))
         machine = Machine(name=name, address=address, at=part.key_at())
         first = self._machines.setdefault(name, machine)

@@ -201,9 +201,8 @@ def expand(name: str, node_name: str, namespace: str) -> str:
     if not expanded.startswith("/"):
         expanded = f"{prefix}/{expanded}"
     if problem := full_name_problem(expanded):
-        raise NameNotLegalError(
-            f"cannot use {quote(name)}, which expands to {quote(expanded)}: {problem}"
-        )
+        becomes = "" if expanded == name else f", which expands to {quote(expanded)}"
+        raise NameNotLegalError(f"cannot use {quote(name)}{becomes}: {problem}")
     return expanded
 
 

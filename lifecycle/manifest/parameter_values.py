@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.yaml.document import quote
@@ -20,6 +21,7 @@ def type_of(value: ParameterValue) -> str:
     return SCALARS[type(value)]
 
 
+_NUMBERS = {"int": re.compile(r"[+-]?\d+"), "double": re.compile(r"[+-]?\d+(\.\d*)?")}
 _IMPLICIT = ("use_sim_time", "start_type_description_service")
 
 
@@ -49,6 +51,8 @@ def suggestion(value: ParameterValue, declared: str) -> str:
     """Return how to write the value so that it fits; empty if not known."""
     if declared == "double" and isinstance(value, int) and not isinstance(value, bool):
         return f"write {float(value)}"
+    if declared in _NUMBERS and isinstance(value, str) and _NUMBERS[declared].fullmatch(value):
+        return f"write {value} as a number, not as text"
     if declared == "string" and not isinstance(value, (str, tuple)):
         return "put it in quotes"
     if declared == "double_array" and type_of(value) == "int_array" and isinstance(value, tuple):

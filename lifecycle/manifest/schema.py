@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -191,12 +192,40 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
         if key in known:
             continue
         place, message = (*_place(each), key), f"cannot use the unknown key {quote(key)}"
-        meant, where = did_you_mean(key, known), _elsewhere(place)
+        where = _elsewhere(place)
+        meant = _written(place[:-1], key, known) or did_you_mean(key, known)
+        value = each.instance[key]
+        if "nodes" in known and isinstance(value, dict) and "run" in value:
+            meant = "a node is indented below 'nodes:'"
         if not meant and (not where or len(known) <= _FEW):
             message = f"{message}; allowed: {', '.join(known)}"
         hint = meant or where
         yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
 
+
+def _written(place: Place, key: str, known: Collection[str]) -> str:
+    """Return how a manifest writes what others call `key`; empty if it has no other name."""
+    text = _OTHERS.get(key, "")
+    other = text.partition(":")[0]
+    where = "" if other in known else _elsewhere((*place, other))
+    return text and f"write '{text}'{where.replace('it is', ',')}"
+
+
+_OTHERS = {
+    "latched": "durability: TRANSIENT_LOCAL",
+    "queue_size": "depth",
+    "pkg": "package",
+    "exec": "executable",
+    "plugin": "component",
+    "args": "command",
+    "cwd": "working_directory",
+    "env": "environment",
+    "remappings": "remap",
+    "params": "parameters",
+    "respawn": "restart: always",
+    "respawn_delay": "restart_sec",
+}
+"""What launch files and client libraries say otherwise, and how a manifest writes it."""
 
 _FEW = 5
 """So many keys are listed also where a better place for an unknown one is named."""
@@ -294,15 +323,18 @@ def _allowed(each: ValidationError) -> tuple[str, str]:
             if inner.validator == "type"
             for name in _listed(inner.validator_value)
         ]
-        return _types(each.instance, types)
+        return _types(each, types)
     if each.validator == "type":
-        return _types(each.instance, _listed(each.validator_value))
+        return _types(each, _listed(each.validator_value))
     if each.validator in {"enum", "const"}:
         allowed = [each.validator_value] if each.validator == "const" else each.validator_value
-        return f"allowed: {_spell(allowed)}", _closest(each.instance, allowed)
+        hint = _closest(each.instance, allowed) or _of_another_key(each)
+        return f"allowed: {_spell(allowed)}", hint
     if each.validator == "pattern":
         return "", _pattern(each)
-    return f"allowed: {_range(each.schema)}", ""
+    is_share = each.schema.get("maximum") == 1 and 1 < each.instance <= 100
+    hint = f"for {each.instance} % write {each.instance / 100:g}" if is_share else ""
+    return f"allowed: {_range(each.schema)}", hint
 
 
 def _way(each: ValidationError) -> tuple[str, str]:
@@ -332,8 +364,9 @@ _TYPES = {
 }
 
 
-def _types(value: object, types: list[str]) -> tuple[str, str]:
-    """Return which types are allowed, and how to get there from `value`."""
+def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
+    """Return which types are allowed, and how to get there from the value."""
+    value = each.instance
     words = [_TYPES[each] for each in types if not (each == "integer" and "number" in types)]
     words = list(dict.fromkeys(words))
     joined = " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
@@ -344,7 +377,53 @@ def _types(value: object, types: list[str]) -> tuple[str, str]:
         hint = "write it without the leading 0, which versions of YAML read differently"
     elif types == ["string"] and isinstance(value, (bool, int, float)):
         hint = "put it in quotes"
+    elif isinstance(value, str) and {"integer", "number"} & {*types}:
+        hint = _number(value, _name(each), each.schema)
+    elif types == ["object"] and value is None:
+        hint = "indent below it what belongs to it"
+    elif _name(each) == "qos" and type(value) is int:
+        hint = f"write {{depth: {value}}}"
+    elif types == ["object"]:
+        key = next(iter((*each.schema.get("required", ()), *_known(each), _NAME)))
+        joined += f", as in {{{key}: …}}"
+    elif types == ["array"] and isinstance(value, str):
+        hint = f"write [{', '.join(value.split())}]"
+    elif isinstance(value, dict) and any(key.startswith("-") for key in value):
+        hint = "put a text with ': ' in quotes"
     return f"it must be {joined}", hint
+
+
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+))\s*([A-Za-z%µ/]*)\s*")
+
+
+def _number(value: str, name: str, schema: Mapping[str, Any]) -> str:
+    """Return how to write a number that is in quotes, or has a unit; empty if it is none."""
+    found = _NUMBER.fullmatch(value)
+    if found is None:
+        return ""
+    number, unit = found.groups()
+    if unit == "%" and schema.get("maximum") == 1:
+        return f"write {float(number) / 100:g}"
+    if not unit:
+        return f"write {number}, without quotes"
+    wanted = name.rpartition("_")[2]
+    if unit.lower() == wanted:
+        return f"write {number}"
+    return f"write the number alone, in {wanted}" if wanted in _UNITS else ""
+
+
+_UNITS = ("s", "sec", "ms", "ns", "hz", "bytes", "mib", "percent")
+"""What the names of keys end with, where they hold a number with a unit."""
+
+
+def _of_another_key(each: ValidationError) -> str:
+    """Return which other policy of a QoS profile takes a value; empty if none does."""
+    policies = read_schema(MANIFEST)["$defs"]["Qos"]["properties"]
+    for other in policies if _name(each) in policies else ():
+        branches = policies[other].get("anyOf", ())
+        if any(each.instance in branch.get("enum", ()) for branch in branches):
+            return f"it is a value of '{other}'"
+    return ""
 
 
 def _range(schema: Mapping[str, Any]) -> str:

@@ -305,8 +305,7 @@ def _find_command(run: Run, environment: Mapping[str, str]) -> None:
         if shutil.which(word, path=folders) is None:
             raise NotThereError(
                 f"cannot find program {word!r} on PATH",
-                hint="install it, name its path, or set PATH in run.environment; PATH is "
-                f"{path[:200]}",
+                hint="install it, name its path, or set PATH in run.environment",
             )
     script = next(iter(arguments), "-")
     if _PYTHON.fullmatch(Path(word).name) and not script.startswith("-"):

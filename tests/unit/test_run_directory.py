@@ -219,8 +219,7 @@ def test_a_word_finds_its_run_or_says_what_runs(tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         find_run([tmp_path], "leg")
     assert str(caught.value) == (
-        "cannot find a running system 'leg'; running: arm@1, arm@2, base@1; "
-        "start it: lifecycle up MANIFEST"
+        "cannot find a running system 'leg'; running: arm@1, arm@2, base@1"
     )
     for each in held:
         each.release()

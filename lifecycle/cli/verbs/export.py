@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 import click
@@ -37,10 +37,11 @@ def command() -> None:
 @manifest_arguments
 @_into("Write policy.xml there; one that is there is replaced.")
 def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
-    """Write access control for ROS 2 security: only what the manifest declares is allowed.
+    """Write access control for ROS 2 security.
 
-    One enclave for each process, and one for each supervisor, in policy.xml, of which `ros2
-    security create_permission` makes signed permissions; the commands that are printed do that.
+    Only what the manifest declares is allowed. policy.xml has one enclave for each process, and one
+    for each supervisor; `ros2 security create_permission` makes signed permissions of it, by the
+    commands that are printed.
     """
     from lifecycle.export.sros2 import enclaves_of, render_policy
 
@@ -70,9 +71,9 @@ _WRITTEN_FOR = {
         "Check the file with `systemd-analyze verify`, copy it to /etc/systemd/system."
     ),
     "kubernetes": (
-        "Write the Kubernetes object of each machine's part, on the node of the machine's name.\n\n"
-        "Ready once active and verified, live while the supervisor answers. "
-        "`kubectl apply -f FILE` takes it."
+        "Write a Kubernetes object for each machine.\n\n"
+        "It is for the node of the machine's name, ready once active and verified, live while the "
+        "supervisor answers. `kubectl apply -f FILE` takes it."
     ),
 }
 
@@ -124,6 +125,7 @@ def _engine_command(engine: str) -> click.Command:
             words=(*assignments, *words),
             image=image,
             program=program,
+            folder=str(PurePosixPath(at).parent if at else Path.cwd()),
             timeout_s=timeout_s,
             programs_networks=any(each.startswith("--program") for each in words),
         )

@@ -43,6 +43,9 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
 
     NODE is a key under `nodes:` or a fully qualified name. What follows --ros-args goes to ROS.
     """
+    if ":=" in node:
+        hint = "it comes before the arguments: lifecycle run MANIFEST NODE NAME:=VALUE"
+        raise UsageError(f"cannot find the node in {node!r}", hint=hint)
     split = words.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in words else len(words)
     plan = load_plan(manifest, words[:split])
     planned = find_node(plan, node)

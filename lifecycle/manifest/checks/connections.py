@@ -45,13 +45,14 @@ _RULES = {
 def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about endpoints that nothing in the manifest connects to."""
     implicit = implicit_names(system)
+    unnamed = {endpoint.kind for _, endpoint, _ in system.unresolved}
     for each in system.endpoints:
         kind = each.endpoint.kind
         other = kind.other_end
         if kind not in _RULES or system.named(other, each.name) or (other, each.name) in implicit:
             continue
         severity = _severity(system, kind)
-        if severity is not None:
+        if severity is not None and other not in unnamed:  # it may be the one with the wrong name
             yield _alone(system, each, other, severity)
 
 

@@ -36,7 +36,9 @@ def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield error("check.flow-dscp", at, message, "the highest is below the lowest: swap them")
     for node in system.manifest.nodes:
         for each in system.needs.of_node(node):
-            yield from _endpoint(node, each.need)
+            if unknown := [*_endpoint(node, each.need)]:
+                yield from unknown
+                continue  # what else it asks for is of no endpoint
             yield from _marking(node, each)
             yield from _class(each)
             if node.run.kind is not RunKind.PYTHON:

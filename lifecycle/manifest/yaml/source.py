@@ -62,7 +62,9 @@ def parse(text: str, *, file: str) -> Document:
         if plain is None:
             raise ManifestError([error("yaml.empty", at, EMPTY, _START)])
         message = f"cannot use {quote(plain)} as a whole document; it must be a mapping of keys"
-        raise ManifestError([error("yaml.root", at, message, _START)])
+        is_launch = quote(plain).startswith("'<launch")
+        hint = f"write a manifest from it: lifecycle import {file}" if is_launch else _START
+        raise ManifestError([error("yaml.root", at, message, hint)])
     return document
 
 
@@ -347,7 +349,7 @@ class _Composer:
         elif key in known:
             line, column = known[key].key or mark
             message = f"cannot use the key {quote(key)} twice"
-            hint = f"remove one; the first stands at {self._file}:{line}:{column}"
+            hint = f"remove one; the first is at {self._file}:{line}:{column}"
             self._note("yaml.duplicate-key", mark, (*place, key), message, hint)
         else:
             return key, True

@@ -83,6 +83,7 @@ _LONGEST_VALUE = 8192
 _OF_A_SESSION = re.compile(
     "_|_ROS_WHEELS_.*|LIFECYCLE_.*|SHLVL|PWD|OLDPWD|SHELL|HOME|USER|LOGNAME|MAIL|HOSTNAME|LANG|LC_.*"
     "|TERM|TERM_.*|COLORTERM|COLUMNS|LINES|LS_COLORS|LESS.*|PAGER|EDITOR|VISUAL|PS[1-4]|PROMPT.*"
+    "|MANPATH|INFOPATH"
     "|HIST.*|VTE_.*|KONSOLE_.*|GNOME_.*|WINDOWID|WINDOWPATH|TMUX.*|STY|SSH_.*|XDG_.*|DBUS_.*|GPG_.*"
     "|DESKTOP_.*|SESSION_.*|DISPLAY|WAYLAND_DISPLAY|XAUTHORITY|INVOCATION_ID|JOURNAL_STREAM"
     "|SYSTEMD_.*|NOTIFY_SOCKET|WATCHDOG_.*|MANAGERPID|LISTEN_.*|SUDO_.*|VIRTUAL_ENV_PROMPT"
@@ -90,8 +91,8 @@ _OF_A_SESSION = re.compile(
 )
 """Variables of a login, of who started it, or that a manifest says otherwise."""
 
-_PATHS = ("PATH", "MANPATH", "INFOPATH")
-"""Lists of folders that matter only by what they have and we have not."""
+_PATHS = ("PATH", "LD_LIBRARY_PATH")
+"""Lists of folders that matter only by what they have and we have not, in whatever order."""
 
 _ROS_LIBRARY = re.compile(r"/lib(rmw|rcl|fastrtps|fastdds|ddsc|zenohc)[^/]*\.so")
 
@@ -182,7 +183,7 @@ def _matters(name: str, value: str, ours: str | None) -> bool:
         return False
     if name in _PATHS:
         known = (ours or "").split(os.pathsep)
-        return name == "PATH" and not set(value.split(os.pathsep)) <= set(known)
+        return not set(value.split(os.pathsep)) <= set(known)
     return True
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Restart, RunKind, Supervision
+from lifecycle.manifest.model import Restart, RosArguments, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
 from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, late_at_s, phase_of, wanted
@@ -115,6 +115,8 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     words = f": {given.words}" if given.words else ""
     end = f"{given.text}{_not_run(process, given)}"
     text = f"cannot keep {what} running: pid {process.pid} died{while_}: {end}{words}{why}"
+    if node is not None and "--ros-args" in given.words:
+        text += f"; if it takes no ROS arguments, write 'ros_args: none' at nodes.{node.key}.run"
     return [_failure(PROCESS_DIED, name, text, process)]
 
 
@@ -187,7 +189,22 @@ def advice(run: Run, node: Node) -> str:
     named = any(each.endswith(f"__node:={planned.name}") for each in process.planned.argv)
     if named or doing(run, node) != APPEARING:
         return ""
-    return f"; if its code calls it otherwise, write 'name: {planned.name}' at nodes.{planned.key}"
+    namespace = node.name.rpartition("/")[0]
+    others = sorted(each for each in run.undeclared if each.rpartition("/")[0] == namespace)
+    if others:
+        shown = " and ".join(map(repr, others[:_NAMED]))
+        name = others[0].rpartition("/")[2] if len(others) == 1 else "…"
+        which = "this one" if len(others) == 1 else "one of them"
+        mend = f"the graph shows {shown}, not declared: if it is {which}, write 'name: {name}'"
+    elif planned.run.ros_args is RosArguments.NONE:
+        mend = "it gets no ROS arguments: write the name that its code gives it as 'name'"
+    else:
+        mend = f"if its code calls it otherwise, write 'name: {planned.name}'"
+    return f"; {mend} at nodes.{planned.key}"
+
+
+_NAMED = 3
+"""Undeclared nodes that are named as what a missing one may be."""
 
 
 def _failure(what: Rule, subject: str, message: str, process: Process | None) -> Failure:

@@ -103,6 +103,7 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
         health: whether nodes are healthy, as far as that is known.
         shown: what others wait for of nodes of ours, as far as the graph shows it.
         appeared: nodes that are in the graph now; what drives them may yet be missing.
+        undeclared: nodes in the graph that the manifest does not declare; None if nothing is new.
         elsewhere: conditions that nodes of other supervisors have reached.
         left: full names of all nodes whose supervisor was shut down; None if nothing is new.
     """
@@ -111,6 +112,7 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
     health: Mapping[str, bool] = {}
     shown: Mapping[str, frozenset[Readiness]] = {}
     appeared: frozenset[str] = frozenset()
+    undeclared: frozenset[str] | None = None
     elsewhere: Mapping[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] | None = None
 

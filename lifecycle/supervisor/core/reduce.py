@@ -247,6 +247,8 @@ def _saw(run: Run, given: messages.Saw) -> list[Event]:
             run.changed()
             node.level, node.guarded = Level.ACTIVE, node.guarded + 1
             events.append(failure.activated(node))
+    if given.undeclared is not None:
+        run.undeclared = given.undeclared
     run.elsewhere = {**run.elsewhere, **given.elsewhere}
     run.left = run.left if given.left is None else given.left
     now = [(each.healthy, each.shown) for each in run.nodes.values()], run.elsewhere, run.left

@@ -469,6 +469,7 @@ class Run(msgspec.Struct, kw_only=True):
     Attributes:
         plan: as it must be now: in its mode, with the ports of what was started again.
         first: as it was made from the manifest in force.
+        undeclared: nodes that the graph showed, and no manifest declares, when one was last missed.
         elsewhere: conditions that nodes of other supervisors have reached, by key.
         left: full names of nodes whose supervisor was shut down, and said so.
         early: keys of the nodes that are configured before any node is wired.
@@ -500,6 +501,7 @@ class Run(msgspec.Struct, kw_only=True):
     first: Plan
     nodes: dict[str, Node]
     processes: dict[str, Process]
+    undeclared: frozenset[str] = frozenset()
     elsewhere: dict[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] = frozenset()
     early: frozenset[str] = frozenset()

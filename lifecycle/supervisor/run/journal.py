@@ -166,7 +166,7 @@ def journal_files(path: Path) -> tuple[Path, ...]:
     if not found or not os.path.exists(path):
         raise UsageError(
             f"cannot find a journal at {str(path)!r}",
-            hint=f"name the log directory of a run, or the file {JOURNAL_NAME} in it",
+            hint=f"name a run by its log directory, by {JOURNAL_NAME} in it, or --system NAME",
         )
     return found
 

@@ -220,7 +220,7 @@ class Processes:
         until_s = loop.time() + FORGOTTEN_S
         while self._system.run.ending is None and (left_s := until_s - loop.time()) > 0:
             changed = self._shell.changed
-            if not await self._shell.is_seen(name):
+            if name not in await self._shell.seen():
                 return
             await set_within(changed, min(left_s, _AGAIN_S))
 

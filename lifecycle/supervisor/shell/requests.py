@@ -235,8 +235,12 @@ class Requests:
             if planned.managed:
                 node.state = UNCONFIGURED
             return Level.STARTED
+        declared = {each.full_name for each in self._system.plan.nodes}
         changed = self._shell.changed
-        while not await self._shell.is_seen(node.name):  # the core sets the limit
+        while node.name not in (seen := await self._shell.seen()):  # the core sets the limit
+            undeclared = frozenset(each for each in seen - declared if "/_" not in each)
+            if undeclared != self._system.run.undeclared:
+                self._shell.give(messages.Saw(undeclared=undeclared))
             await set_within(changed, None)
             changed = self._shell.changed
         self._shell.give(messages.Saw(appeared=frozenset({node.core.key})))

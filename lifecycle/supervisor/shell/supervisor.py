@@ -334,12 +334,12 @@ class Supervisor:
                 away, hung = liveliness.is_out_of_reach(name), name in hangs
                 self.give(messages.Silent(node=node.core.key, why=why, away=away, hangs=hung))
 
-    async def is_seen(self, name: str) -> bool:
-        """Return whether discovery shows a node of this name."""
+    async def seen(self) -> frozenset[str]:
+        """Return the full names of the nodes that discovery shows."""
         observation = await self.means.participant.graph.observe(
             self.system.plan, machines=self.system.machines
         )
-        return any(each.full_name == name for each in observation.nodes)
+        return frozenset(each.full_name for each in observation.nodes)
 
     def may_activate(self, key: str) -> bool:
         """Return whether the gate is open for a node in this very moment."""

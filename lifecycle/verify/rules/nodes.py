@@ -74,10 +74,9 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
         elif node.run.kind is RunKind.ATTACH:
             hint = "start it: the manifest attaches to it; compare domain, RMW and discovery range"
         elif name in others:
-            hint = (
-                f"is it {' or '.join(others[name])}? its command chooses the name; a `name` in the"
-                " manifest is given to the command, or take the name that it has as the key"
-            )
+            meant = others[name]
+            chosen = meant[0].rpartition("/")[2] if len(meant) == 1 else "…"
+            hint = f"is it {' or '.join(meant)}? write 'name: {chosen}' at nodes.{node.key}"
         elif not brings_up(node, view.machines):
             machine = f" --machine {node.machine}" if node.machine else ""
             hint = f"its machine has a supervisor of its own: lifecycle up MANIFEST{machine}"

@@ -24,7 +24,7 @@ from lifecycle.verify.view import NodeFacts, View
 MISSING = Rule(
     id="param.missing",
     meaning="a node does not have a parameter that is declared or given",
-    fix="correct the name, or have the node declare it; a value for none has no effect",
+    fix="correct the name, or have the node declare it",
     heals=Heals.WITH_TIME,
 )
 TYPE_DIFFERS = Rule(

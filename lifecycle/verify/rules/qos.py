@@ -33,8 +33,8 @@ QOS_UNVERIFIABLE = Rule(
     id="graph.qos-unverifiable",
     meaning="declared QoS policies can be read neither from discovery nor from the node",
     outcomes=(Outcome.UNVERIFIABLE,),
-    fix="Fast DDS does not announce history and depth: only a node that reports its"
-    " configuration can prove them; a policy that is not written is not required",
+    fix="Fast DDS does not announce history and depth, only nodes in our host report them: leave"
+    " both out, write the other policies instead of a preset, or `trust` this rule",
 )
 QOS_INCOMPATIBLE = Rule(
     id="graph.qos-incompatible",

@@ -362,8 +362,7 @@ def test_orders_that_name_nothing_are_refused(active: Up, shared_domain: int) ->
             "cannot restart talker, listener at once; name one node, or none\n"
         ),
         ("pause", "pear"): (
-            f"cannot find a running system 'pear'; running: pair@{shared_domain}; "
-            "start it: lifecycle up MANIFEST\n"
+            f"cannot find a running system 'pear'; running: pair@{shared_domain}\n"
         ),
     }
     for words, said in refusals.items():

@@ -273,6 +273,20 @@ _ENDS = [
 ]
 
 
+def test_a_node_that_its_code_names_otherwise_is_named_as_the_graph_shows_it(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    plain = "import rclpy; rclpy.init(); rclpy.spin(rclpy.create_node('plain'))"
+    node = {"run": {"command": [sys.executable, "-c", plain]}, "timeouts": {"start_s": 4}}
+    with up(write(tmp_path, fresh_domain, {"driver": node}, "one"), runtime=tmp_path) as run:
+        said = run.until("notice")["message"]
+        assert said.startswith("'/driver' is still waiting to appear in the graph, for up to "), (
+            said
+        )
+        mends = "if it is this one, write 'name: plain' at nodes.driver"
+        assert said.endswith(f"; the graph shows '/plain', not declared: {mends}"), said
+
+
 @pytest.mark.parametrize(("how", "code"), _ENDS)
 def test_a_run_that_is_ended_before_it_was_verified_is_no_success(
     tmp_path: Path, fresh_domain: int, how: int | str, code: ExitCode

@@ -12,6 +12,7 @@ from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.programming.programmer import read_treatment
 from lifecycle.programming.target import Chosen, ProgrammingError, read_targets
+from lifecycle.run_directory import RunDirectory
 from tests.builders import nfe
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import nef_settings, settings_file
@@ -32,9 +33,16 @@ def nef_options(tmp_path: Path, url: str) -> tuple[Chosen, ...]:
     return (read_targets(["nef"], {"config": settings_file(tmp_path, nef=settings)})[0],)
 
 
-def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown() -> None:
+def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = CliRunner()
-    assert "Missing argument 'TARGET'" in run.invoke(flows_verb.command, []).output
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "lifecycle").mkdir(mode=0o700)
+    held = RunDirectory.acquire(tmp_path / "lifecycle", "robot@3", "abc")
+    missing = run.invoke(flows_verb.command, []).output
+    assert "Missing argument 'TARGET'. It is a manifest, or a system; running: robot@3" in missing
+    held.release()
     shown = run.invoke(flows_verb.command, ["a.yaml", "--export", "nft", "--watch"])
     assert str(shown.exception) == "cannot use --export with --watch; export once"
     for verb in ("apply", "remove"):

@@ -42,7 +42,7 @@ def test_every_finding_of_a_bad_manifest_comes_before_the_summary(
     publishers = "nodes.talker.interface.publishers"
     wanted = "it must be a string or a mapping"
     assert capsys.readouterr().out.splitlines() == [
-        f"{path}:8:53: {publishers}[0].qos: cannot use qos 10; {wanted}",
+        f"{path}:8:53: {publishers}[0].qos: cannot use qos 10; {wanted}; write {{depth: 10}}",
         f"{path}:9:53: {publishers}[1].qos: cannot use a list as qos; {wanted}",
         f"{path}: not ok (2 errors)",
     ]
@@ -249,6 +249,8 @@ def test_a_manifest_may_be_named_by_its_package_and_file_as_ros2_launch_does(
     assert main(["check", "robot", "first.lifecycle.yaml", "greeting:=Hi"]) == 0
     assert main(["check", "robot", "other.lifecycle.yaml"]) == 2
     assert main(["check", "robt", "first.lifecycle.yaml"]) == 2
+    assert main(["check", "submarine", "first.lifecycle.yaml"]) == 2
+    assert main(["run", "robot", "greeting:=Hi"]) == 2
 
     out, err = capsys.readouterr()
     assert out.startswith("first_node: 2 nodes")
@@ -256,4 +258,12 @@ def test_a_manifest_may_be_named_by_its_package_and_file_as_ros2_launch_does(
     assert err.splitlines() == [
         f"cannot choose 'other.lifecycle.yaml': no such manifest in {where}: first.lifecycle.yaml",
         "cannot find a file or a package 'robt'; did you mean 'robot'?",
+        (
+            "cannot find a file or a package 'submarine'; source the setup file of the package's "
+            "workspace"
+        ),
+        (
+            "cannot find the node in 'greeting:=Hi'; it comes before the arguments: lifecycle run "
+            "MANIFEST NODE NAME:=VALUE"
+        ),
     ]

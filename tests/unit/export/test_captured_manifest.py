@@ -138,9 +138,9 @@ def test_what_is_not_told_is_marked_on_its_line(tmp_path: Path) -> None:
     text = to_manifest(captured())
     assert text.startswith(
         "# yaml-language-server: $schema=manifest.v1.schema.json\n"
-        "# Captured from domain 7, discovery range localhost. What a graph does not tell is "
+        "# Captured from domain 7, discovery range localhost. What a graph does not show is "
         "marked: gap.\n"
-        "# gap: not ours, so that machine, process, flows, DSCP, history and depth are not told: "
+        "# gap: not ours, so that machine, process, flows, DSCP, history and depth are unknown: "
         "/left/base,\n"
         "# /left/scanner, /on, /right/scanner\n"
         "# gap: remaps cannot be seen: names are those in the graph, not those in the nodes' code\n"
@@ -153,7 +153,7 @@ def test_what_is_not_told_is_marked_on_its_line(tmp_path: Path) -> None:
     )
     assert "          qos:  # gap: the graph does not show the QoS of services\n" in text
     assert "          type: double  # gap: its value is not finite\n" in text
-    assert '          default_value: "08"  # gap: its value now; the default is not told\n' in text
+    assert '          default_value: "08"  # gap: its value now; the default is not known\n' in text
     assert "use_sim_time" not in text
     assert "qos_overrides" not in text
 

@@ -67,9 +67,17 @@ def test_each_machine_has_a_unit_that_starts_its_part(tmp_path: Path) -> None:
     assert service["ExecStart"] == (
         f"/opt/lifecycle/bin/lifecycle up {TELEOP} --machine robot domain:=7 --strict"
     )
+    assert service["WorkingDirectory"] == str(Path.cwd())
     assert service["Type"] == "notify"
     assert (service["Restart"], service["RestartPreventExitStatus"]) == ("on-failure", "2 3 4 5 7")
     assert "AmbientCapabilities" not in service
+
+
+def test_relative_programs_are_looked_for_beside_a_manifest_that_is_elsewhere(
+    tmp_path: Path,
+) -> None:
+    files = exported(tmp_path, "systemd", TELEOP, "--at", "/etc/100%/t.lifecycle.yaml")
+    assert sections(files["teleop-robot.service"])["Service"]["WorkingDirectory"] == "/etc/100%%"
 
 
 def test_who_programs_networks_may_do_that_and_no_more(tmp_path: Path) -> None:

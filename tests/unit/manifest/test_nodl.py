@@ -259,7 +259,7 @@ def test_two_declarations_of_one_name_collide(tmp_path: Path) -> None:
     assert found == [
         (
             "b.yaml:3:5: publishers[0]: cannot declare publisher 'same' twice; "
-            "the first stands at a.yaml:5:5; remove one"
+            "the first is at a.yaml:5:5; remove one"
         )
     ]
 

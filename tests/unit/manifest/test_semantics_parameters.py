@@ -43,7 +43,9 @@ def test_a_value_fits_its_own_type(value: ParameterValue, type_: str) -> None:
         (True, "int", "true: it is a bool, declared is int", ""),
         (1.0, "int", "1.0: it is a double, declared is int", ""),
         (5, "string", "5: it is an int, declared is string", "put it in quotes"),
-        ("1", "int", "'1': it is a string, declared is int", ""),
+        ("1", "int", "'1': it is a string, declared is int", "write 1 as a number, not as text"),
+        ("1.5", "int", "'1.5': it is a string, declared is int", ""),
+        ("fast", "double", "'fast': it is a string, declared is double", ""),
         (1, "int_array", "1: it is an int, declared is int_array", "write [1]"),
         ((), "int", "[]: it is an array, declared is int", ""),
         (
@@ -198,7 +200,8 @@ nodes:
             "camera: {ros__parameters: {rate: !!str 5}}",
             (
                 "check.parameter-type p.yaml:1:28: camera.ros__parameters.rate: cannot set "
-                "parameter 'rate' of '/camera' to '5': it is a string, declared is double"
+                "parameter 'rate' of '/camera' to '5': it is a string, declared is double; "
+                "write 5 as a number, not as text"
             ),
         ),
         (

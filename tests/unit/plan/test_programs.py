@@ -283,7 +283,7 @@ def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
     assert said(command("talk", environment=path)) == [
         (
             "cannot find program 'talk' on PATH; install it, name its path, or set PATH in "
-            "run.environment; PATH is /nowhere"
+            "run.environment"
         )
     ]
     assert said(command("bin/talkr")) == [

@@ -205,6 +205,18 @@ def test_a_verdict_is_said_once_and_before_active_as_what_is_still_wrong() -> No
     ]
 
 
+def test_what_is_missing_is_said_once_while_it_becomes_less() -> None:
+    rules = ("graph.missing-node", "graph.missing-endpoint", "state.wrong-state")
+
+    def judged(*rules: str) -> VerdictChanged:
+        outcome = Outcome.VIOLATED if rules else Outcome.OK
+        return VerdictChanged(stage=Stage.CONNECTED, verdict=verdict_of(outcome, *rules))
+
+    events = [judged(*rules), judged(*rules[:2]), judged(rules[0]), judged(rules[1]), judged()]
+    said = [line.partition(";")[0] for line in written(PlainLines, *events)]
+    assert said == ["not verified yet", "not verified yet", "connected: verdict ok"]
+
+
 def test_states_on_the_way_down_have_no_lines_and_those_that_others_cause_have() -> None:
     def changed(state: str, reach: Reach = Reach.ACTIVE) -> NodeChanged:
         return NodeChanged(node="/camera", reach=reach, state=state, connected=True)

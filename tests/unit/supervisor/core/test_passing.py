@@ -6,7 +6,14 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, Discovery, OnFailure, RunKind, Timeouts
+from lifecycle.manifest.model import (
+    Condition,
+    Discovery,
+    OnFailure,
+    RosArguments,
+    RunKind,
+    Timeouts,
+)
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.failure import ALSO_S
@@ -114,6 +121,36 @@ def test_that_key_is_named_too_where_the_node_is_given_up_a_moment_before_its_ti
     play.finish("driver start", error="cannot call its service")
     ((_, said),) = play.failures
     assert said.endswith("service; if it is a plain node, write 'managed: false' at nodes.driver")
+
+
+@pytest.mark.parametrize(
+    ("undeclared", "ros_args", "mends"),
+    [
+        ((), RosArguments.AUTO, "if its code calls it otherwise, write 'name: driver'"),
+        (("/arm/joints",), RosArguments.AUTO, "if its code calls it otherwise, write 'name: dri"),
+        ((), RosArguments.NONE, "it gets no ROS arguments: write the name that its code gives"),
+        (
+            ("/lidar",),
+            RosArguments.NONE,
+            "the graph shows '/lidar', not declared: if it i",
+        ),
+        (("/lidar",), RosArguments.AUTO, "if it is this one, write 'name: lidar' at nodes.driver"),
+        (("/b", "/a"), RosArguments.AUTO, "the graph shows '/a' and '/b', not declared"),
+    ],
+)
+def test_a_node_that_does_not_appear_is_named_with_what_the_graph_shows_instead(
+    undeclared: tuple[str, ...], ros_args: RosArguments, mends: str
+) -> None:
+    node = planned_node("driver", kind=RunKind.COMMAND, timeouts=Timeouts(start_s=10.0))
+    node = replace(node, run=replace(node.run, ros_args=ros_args))
+    play = Play(plan_of(node), ways={"driver start": "hang"})
+    play.give(messages.Saw(undeclared=frozenset(undeclared)))
+    play.wait(2.1)
+    (said,) = (each.message for each in play.heard(Notice))
+    assert said.startswith("'/driver' is still waiting to appear in the graph, for up to 8 s more;")
+    assert mends in said
+    play.wait(8.0)
+    assert mends in play.failures[0][1]
 
 
 @pytest.mark.parametrize(
