@@ -19,6 +19,13 @@ _DRIFT = 10_000
 """Two clocks drift apart by one part of so many, 100 ppm, at most. RFC 5905 §7.2 allows 15 ppm for
 one clock; the quartz of one that nothing disciplines is off by up to 50 ppm."""
 
+_SLEW = 1_600
+"""While one is slewed, by one part of so many, 625 ppm: adjtime(3) and what the kernel does for
+adjtimex(2) make it 500 ppm faster or slower."""
+
+_SLEWED_NS = 60_000_000_000
+"""A clock may be slewed for so long since an exchange has shown that."""
+
 JUDGED_S = DELAY_S + 3 * SLOT_S
 """Messages that are judged are this old at most: a slot is closed and reported within two more, and
 a busy host has another one."""
@@ -60,14 +67,16 @@ class ClockComparison:
     """
 
     def __init__(self) -> None:
-        # Between which two the offset was, and when.
-        self._known: tuple[int, int, int] | None = None
+        # Between which two the offset was, and when, if clocks drift apart by one part of the key.
+        self._known: dict[int, tuple[int, int, int]] = {}
         self._set_ns: int | None = None
+        self._slewed_ns: int | None = None
 
     def add(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
         """Take an exchange, whose answer may have waited.
 
-        An exchange that contradicts those before it shows that a clock was set: they are forgotten.
+        An exchange that contradicts itself or those before it shows that a clock is slewed; or, by
+        more than that explains, that one was set: they are forgotten.
 
         Args:
             t1_ns: a message was sent, on our clock, ...
@@ -75,34 +84,52 @@ class ClockComparison:
             t3_ns: later the other sent one, on its clock, ...
             t4_ns: ... and it was received, on ours.
         """
+        took_ns, back_ns, there_ns = t4_ns - t1_ns, t3_ns - t4_ns, t2_ns - t1_ns
+        if took_ns < 0 or back_ns - there_ns > 2 * _drift_ns(took_ns, _SLEW):
+            self._set_ns = t4_ns  # in the middle of it: nothing else is known of it
+            return
+        *_, at_ns = self._known.get(_SLEW, (t4_ns,))
+        fits = {
+            rate: self._take(rate, took_ns, back_ns, there_ns, t4_ns) for rate in (_DRIFT, _SLEW)
+        }
+        if not fits[_SLEW] or (not fits[_DRIFT] and abs(t4_ns - at_ns) > _JUDGED_NS):
+            self._set_ns = t4_ns
+        elif not fits[_DRIFT]:
+            self._slewed_ns = t4_ns
+
+    def _take(self, rate: int, took_ns: int, back_ns: int, there_ns: int, now_ns: int) -> bool:
+        """Return whether an exchange contradicts nothing that is known, where clocks drift so."""
         # It was so at some time between.
-        drift = _drift_ns(t4_ns - t1_ns)
-        low, high = t3_ns - t4_ns - drift, t2_ns - t1_ns + drift
-        if t4_ns < t1_ns or low > high:
-            return  # a clock was set in the middle of it
-        if self._known is not None:
-            least, most, at_ns = self._known
-            drift = _drift_ns(t4_ns - at_ns)
-            best = max(low, least - drift), min(high, most + drift)
-            if best[0] <= best[1]:
-                low, high = best
-            else:
-                self._set_ns = t4_ns
-        self._known = low, high, t4_ns
+        low, high = back_ns - _drift_ns(took_ns, rate), there_ns + _drift_ns(took_ns, rate)
+        if low > high:
+            return False
+        least, most, at_ns = self._known.get(rate, (low, high, now_ns))
+        drift = _drift_ns(now_ns - at_ns, rate)
+        best = max(low, least - drift), min(high, most + drift)
+        fits = best[0] <= best[1]
+        self._known[rate] = (*(best if fits else (low, high)), now_ns)
+        return fits
 
     def offset(self, now_ns: int) -> ClockOffset | None:
         """Return the offset of delays that are judged at a time of our clock, and so at that time.
 
         None before the first exchange, and while some of these may be from before a clock was set.
         """
-        is_new = self._set_ns is not None and abs(now_ns - self._set_ns) < _JUDGED_NS
-        if self._known is None or is_new:
+        if self._is_since(self._set_ns, now_ns, _JUDGED_NS):
             return None
-        low, high, at_ns = self._known
-        drift = max(_drift_ns(each - at_ns) for each in (now_ns, now_ns - _JUDGED_NS))
+        rate = _SLEW if self._is_since(self._slewed_ns, now_ns, _SLEWED_NS) else _DRIFT
+        if rate not in self._known:
+            return None
+        low, high, at_ns = self._known[rate]
+        drift = max(_drift_ns(each - at_ns, rate) for each in (now_ns, now_ns - _JUDGED_NS))
         low, high = low - drift, high + drift
         return ClockOffset(offset_ms=(low + high) / 2e6, uncertainty_ms=(high - low + 1) / 2e6)
 
+    @staticmethod
+    def _is_since(at_ns: int | None, now_ns: int, within_ns: int) -> bool:
+        return at_ns is not None and abs(now_ns - at_ns) < within_ns
 
-def _drift_ns(duration_ns: int) -> int:
-    return abs(duration_ns) // _DRIFT + 1
+
+def _drift_ns(duration_ns: int, rate: int) -> int:
+    """Return by how much clocks drift apart at most, at one part of `rate`."""
+    return abs(duration_ns) // rate + 1

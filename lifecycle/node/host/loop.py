@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import MultiThreadedExecutor, ShutdownException
 from rclpy.node import Node
 from rclpy.timer import Timer
@@ -323,7 +324,8 @@ class NodeLoop:
             except ShutdownException:  # noqa: PERF203
                 return
             except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
-                self._failed(error)
+                if not _is_of_destroyed(error):
+                    self._failed(error)
 
     def _failed(self, error: Exception | SystemExit) -> None:
         if not self._context.ok():
@@ -361,6 +363,15 @@ class NodeLoop:
         )
         sys.stderr.flush()
         os._exit(self._code or 1)
+
+
+def _is_of_destroyed(error: BaseException) -> bool:
+    """Return whether rclpy could not take an event, because its endpoint was destroyed since.
+
+    Its EventsExecutor has events in a queue, from which none is removed.
+    """
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return isinstance(error, InvalidHandle) and last.name == "take_data"
 
 
 @contextlib.contextmanager

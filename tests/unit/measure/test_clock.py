@@ -118,11 +118,40 @@ def test_a_clock_that_is_set_makes_what_was_known_of_it_void_until_old_delays_ar
     assert hosts.known(now_ns).offset_ms == pytest.approx(7 + step_ns / 1e6, abs=0.5)
 
 
-def test_an_exchange_during_which_a_clock_was_set_back_proves_nothing() -> None:
-    comparison = ClockComparison()
-    comparison.add(START, START, START + 10, START - NS)
-    comparison.add(START, START, START + NS, START + 10)
-    assert comparison.offset(START) is None
+class Slewed(Hosts):
+    """One is slewed from the 20th to the 120th second."""
+
+    def offset_ns(self, now_ns: int) -> int:
+        return self.ahead_ns + round(min(max(now_ns - START - 20 * NS, 0), 100 * NS) * self.drift)
+
+
+@pytest.mark.parametrize("slew", [500e-6, -500e-6])
+@pytest.mark.parametrize("way_ns", [10_000, 200_000])
+@pytest.mark.parametrize("waits_ns", [0, 900_000_000])
+def test_a_clock_that_is_slewed_is_known_all_the_time_only_less_well(
+    slew: float, way_ns: int, waits_ns: int
+) -> None:
+    hosts = Slewed(7_000_000, slew)
+    for second in range(200):
+        now_ns = hosts.exchange(START + second * NS, way_ns, waits_ns, way_ns)
+        found = hosts.known(now_ns)
+        # It may take some seconds to contradict what was known.
+        unnoticed_ms = 1.5 if 20 <= second < 25 else 0
+        for at_ns in (now_ns, now_ns - round(JUDGED_S * NS)):
+            error_ms = abs(hosts.offset_ns(at_ns) / 1e6 - found.offset_ms)
+            assert error_ms <= found.uncertainty_ms + unnoticed_ms, second
+        assert found.uncertainty_ms < 6
+    assert found.uncertainty_ms < 1.5
+
+
+@pytest.mark.parametrize("here_ns", [-NS, 10])
+def test_an_exchange_during_which_a_clock_was_set_shows_that_and_nothing_else(here_ns: int) -> None:
+    hosts = Hosts()
+    now_ns = hosts.exchange(START, 200_000, 0, 200_000)
+    hosts.comparison.add(now_ns, now_ns, now_ns + NS, now_ns + here_ns)
+    assert hosts.comparison.offset(now_ns) is None
+    later_ns = hosts.exchange(now_ns + 8 * NS, 200_000, 0, 200_000)
+    assert hosts.known(later_ns).offset_ms == pytest.approx(0, abs=0.5)
 
 
 def test_of_several_clocks_holds_what_holds_for_each() -> None:
