@@ -111,37 +111,28 @@ def check_mapped(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
 
 def check_connection_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about names of connections that something else has."""
+    rule, mode = "check.connection-name", system.manifest.discovery.mode
     hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
-    for node in system.manifest.nodes:
-        for each in node.connections:
-            yield from _name(system, node, each, hidden)
-
-
-def _name(
-    system: DeclaredSystem,
-    node: Node,
-    connection: ConnectionDeclaration,
-    hidden: dict[str, tuple[Node, ConnectionDeclaration]],
-) -> Iterator[Diagnostic]:
-    reserved = ""
-    if _FLOW_NAME.match(connection.name):
-        reserved = "it names a participant that tells a flow apart"
-    mode = system.manifest.discovery.mode
-    if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
-        reserved = "in discovery mode static_endpoints it carries every topic"
-    if reserved:
-        message = f"cannot name a connection {connection.name!r}: {reserved}"
-        yield error("check.connection-name", connection.at, message, "choose another name")
-    namespace, _, base = node.full_name.rpartition("/")
-    name = f"{namespace}/_{base}_{connection.name}"
-    owner, other = hidden.setdefault(name, (node, connection))
-    if other is not connection:
-        message = (
-            f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
-            f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
-            f"({other.at.spelled})"
-        )
-        yield error("check.connection-name", connection.at, message, "choose another name")
+    declared = ((node, each) for node in system.manifest.nodes for each in node.connections)
+    for node, connection in declared:
+        reserved = ""
+        if _FLOW_NAME.match(connection.name):
+            reserved = "it names a participant that tells a flow apart"
+        if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
+            reserved = "in discovery mode static_endpoints it carries every topic"
+        if reserved:
+            message = f"cannot name a connection {connection.name!r}: {reserved}"
+            yield error(rule, connection.at, message, "choose another name")
+        namespace, _, base = node.full_name.rpartition("/")
+        name = f"{namespace}/_{base}_{connection.name}"
+        owner, other = hidden.setdefault(name, (node, connection))
+        if other is not connection:
+            message = (
+                f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
+                f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
+                f"({other.at.spelled})"
+            )
+            yield error(rule, connection.at, message, "choose another name")
 
 
 def check_lossy(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:

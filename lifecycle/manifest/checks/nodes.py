@@ -16,7 +16,6 @@ from lifecycle.manifest.model import (
     Consequence,
     EndpointPolicy,
     Node,
-    Reaction,
     Readiness,
     ReadyBy,
     Restart,
@@ -134,31 +133,29 @@ def check_health(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
 
 
 def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about violations after which nodes are to be deactivated that never can be."""
-    hint = "write 'pause' or 'stop', which are for the whole system"
-    for node in system.manifest.nodes:
+    """Yield findings about what is done on a violation that cannot be done."""
+    rule, manifest = "check.on-violation", system.manifest
+    modes = [each.name for each in manifest.modes]
+    several = len({node.machine for node in manifest.nodes}) > 1
+    reactions = [
+        (each, manifest.where(f"on_violation.{each.rule}")) for each in manifest.on_violation
+    ]
+    for node in manifest.nodes:
         for each in node.on_violation:
             at = node.where(f"on_violation.{each.rule}")
+            reactions.append((each, at))
             if each.what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
                 message = f"cannot deactivate {node.key!r} when it violates: {why}"
-                yield error("check.on-violation", at, message, hint)
-            yield from _mode(system, each, at)
-    for each in system.manifest.on_violation:
-        yield from _mode(system, each, system.manifest.where(f"on_violation.{each.rule}"))
-
-
-def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:
-    modes = [each.name for each in system.manifest.modes]
-    if reaction.what is not Consequence.MODE:
-        return
-    if reaction.mode not in modes:
-        message = f"cannot enter mode {reaction.mode!r} on a violation: there is no such mode"
-        hint = did_you_mean(reaction.mode, modes) or "declare it under 'modes:'"
-        yield error("check.on-violation", at, message, hint)
-    elif len({node.machine for node in system.manifest.nodes}) > 1:
-        message = f"cannot enter mode {reaction.mode!r} on a violation: several machines run in it"
-        hint = "write 'deactivate', 'pause' or 'stop'; a mode is switched by one supervisor"
-        yield error("check.on-violation", at, message, hint)
+                hint = "write 'pause' or 'stop', which are for the whole system"
+                yield error(rule, at, message, hint)
+    for each, at in reactions:
+        what = f"cannot enter mode {each.mode!r} on a violation"
+        if each.what is Consequence.MODE and each.mode not in modes:
+            hint = did_you_mean(each.mode, modes) or "declare it under 'modes:'"
+            yield error(rule, at, f"{what}: there is no such mode", hint)
+        elif each.what is Consequence.MODE and several:
+            hint = "write 'deactivate', 'pause' or 'stop'; a mode is switched by one supervisor"
+            yield error(rule, at, f"{what}: several machines run in it", hint)
 
 
 def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
