@@ -18,8 +18,7 @@ import msgspec
 import yaml
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Resources, Restart, Timeouts
-from lifecycle.manifest.shared import THIS_HOST
+from lifecycle.manifest.model import THIS_HOST, Resources, Restart, Timeouts
 from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
 from lifecycle.run_directory import run_name

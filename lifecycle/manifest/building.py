@@ -1,7 +1,13 @@
-"""Validated `nodes:`, `data_layer:`, `modes:` and `connections:` → frozen types.
+"""Validated sections of a document → frozen types; what nodes share, by nearness.
 
-Owns: how a node's keys become fields and its paths absolute; and the findings about all of them
-that a schema cannot detect. Pure but for reading interfaces by reference.
+Owns: how a node's keys become fields, its paths absolute and its parameters flat; how values that
+are written for many nodes (`parameters:`, `remap:`, `restart:` … of documents and groups) reach
+each; and the findings about all of them that a schema cannot detect. Reads interfaces by reference.
+
+What is nearer to a node wins: the node itself, its parameter files, its group, the groups around
+it, its document, the documents that include that. A shared parameter is for the nodes that have it,
+as under `/**` in a parameter file: an interface without it is not given it. What is done when a
+process fails (`restart:` …) all nodes of the process share, whichever of them says it.
 """
 
 from __future__ import annotations
@@ -10,14 +16,20 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest import written
-from lifecycle.manifest.diagnostics import Diagnostic, Findings, Position, error
+from lifecycle.manifest.diagnostics import Diagnostic, Findings, Position, error, note, warning
 from lifecycle.manifest.interface import build_inline, read_interface
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     PROCESS_KEYS,
     QUANTILE,
     RATE_SLACK,
+    SIM_TIME,
+    SUPERVISION_KEYS,
+    THIS_HOST,
     After,
     Condition,
     ConnectionDeclaration,
@@ -26,6 +38,7 @@ from lifecycle.manifest.model import (
     Executor,
     FlowNeed,
     Interface,
+    Manifest,
     MeasuredKeys,
     Mode,
     ModeParameter,
@@ -43,10 +56,193 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
-from lifecycle.manifest.shared import Shared, build_parameters, flat_parameters, parameter_value
-from lifecycle.manifest.written import build, read_part
-from lifecycle.manifest.yaml.document import Document
-from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.manifest.parameter_files import ParameterFiles
+from lifecycle.manifest.parameter_values import is_implicit
+from lifecycle.manifest.written import build, read, read_part
+from lifecycle.manifest.yaml.document import YAML_1_1_BOOLEANS, Document, has_leading_zero, quote
+from lifecycle.network.connection_url import ConnectionUrlError, parse
+
+
+class Shared(msgspec.Struct, frozen=True, kw_only=True):
+    """What all nodes of a document or group get from it and from what is around it.
+
+    Attributes:
+        prefix: of their keys, `left/arm`; empty for none.
+        namespace: before their own, `left/arm`; empty for none.
+        parameters: value and place, by name.
+        remap: new name and place, by the name in the node's code.
+        machine: where a node runs that names no machine.
+        supervision: value and place, by key of `Supervision`.
+    """
+
+    prefix: str = ""
+    namespace: str = ""
+    machine: str = THIS_HOST
+    parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
+    remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
+    supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
+
+    def inner(self, root: Document, found: Findings) -> Shared:
+        """Return what holds inside a document or group, or in what an include names."""
+        parameters = flat_parameters(root.entries("parameters"), found)
+        sim_time = root.get(SIM_TIME)
+        if sim_time is not None and SIM_TIME in parameters:
+            message = f"cannot set {SIM_TIME} twice"
+            found.append(
+                error("manifest.duplicate-parameter", sim_time.key_at(), message, "remove one")
+            )
+        elif sim_time is not None and isinstance(sim_time.scalar, bool):
+            parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at())
+        remap = {name: (each.root.text, each.key_at()) for name, each in root.entries("remap")}
+        keys = {key: value for key, value in root.plain().items() if key in SUPERVISION_KEYS}
+        written = read(keys, Supervision, strict=False)
+        supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
+        return Shared(
+            prefix=self.key(root.text("prefix")) if "prefix" in root else self.prefix,
+            namespace=self.within(root.text("namespace")),
+            machine=root.text("machine", self.machine),
+            parameters={**self.parameters, **parameters},
+            remap={**self.remap, **remap},
+            supervision={**self.supervision, **supervision},
+        )
+
+    def key(self, key: str) -> str:
+        """Return what a key of a node here is called in the system."""
+        return f"{self.prefix}/{key}" if self.prefix else key
+
+    def within(self, namespace: str) -> str:
+        """Return a namespace below the one here, without slashes at its ends."""
+        return "/".join(each for each in (self.namespace, namespace.strip("/")) if each)
+
+    def given_to(self, node: Node) -> Node:
+        """Return a node with what it does not set itself; who starts it otherwise restarts it."""
+        own, rules = dict(node.parameters), dict(node.remap)
+        parameters = {name: each for name, each in self.parameters.items() if name not in own}
+        remap = {name: each for name, each in self.remap.items() if name not in rules}
+        supervision = {
+            key: each
+            for key, each in self.supervision.items()
+            if key not in node.positions and node.run.kind is not RunKind.ATTACH
+        }
+        positions = {
+            **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
+            **{f"remap.{name}": at for name, (_, at) in remap.items()},
+            **{key: at for key, (_, at) in supervision.items()},
+        }
+        given = {key: value for key, (value, _) in supervision.items()}
+        return replace(
+            node,
+            parameters=(
+                *((name, value) for name, (value, _) in parameters.items()),
+                *node.parameters,
+            ),
+            # rcl takes the first rule that matches: the node's own.
+            remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
+            supervision=replace(node.supervision, **given),
+            shared=node.shared | positions.keys(),
+            positions={**node.positions, **positions},
+        )
+
+
+def settle(manifest: Manifest, files: ParameterFiles, found: Findings) -> Manifest:
+    """Take from nodes the shared parameters that their files set, and those they do not declare.
+
+    Nodes of one process get what any of them says of its supervision. Each node of the manifest
+    has its full name.
+    """
+    found.extend(_for_no_node(manifest.nodes))
+    own: dict[str, dict[str, object]] = {}
+    for node in reversed(manifest.nodes):  # what the first of a process says is kept
+        own.setdefault(node.process_name, {}).update(_own_supervision(node))
+    nodes = []
+    for node in manifest.nodes:
+        said = {**own[node.process_name], **_own_supervision(node)}
+        shared = {name for name, _ in node.parameters if f"parameters.{name}" in node.shared}
+        declared = {each.name for each in node.interface.parameters}
+        gone = {each for each in shared if declared and not is_implicit(each)} - declared
+        if shared:
+            gone |= shared & {name for name, _, _ in files.given(node)}
+        settled = replace(
+            node,
+            supervision=replace(node.supervision, **said),
+            parameters=tuple(each for each in node.parameters if each[0] not in gone),
+            shared=node.shared - {f"parameters.{name}" for name in gone},
+        )
+        nodes.append(settled)
+    return replace(manifest, nodes=tuple(nodes))
+
+
+def _for_no_node(nodes: Iterable[Node]) -> Iterator[Diagnostic]:
+    """Warn of each shared parameter that none of the nodes declares which it is for."""
+    taken: set[Position] = set()
+    unknown: dict[Position, str] = {}
+    for node in nodes:
+        declared = {each.name for each in node.interface.parameters}
+        for name, _ in node.parameters:
+            place = f"parameters.{name}"
+            if place in node.shared and (not declared or name in declared or is_implicit(name)):
+                taken.add(node.where(place))
+            elif place in node.shared:
+                unknown[node.where(place)] = name
+    for at, name in unknown.items():
+        if at not in taken:
+            message = f"cannot set parameter {name!r}: no node that it is for declares it"
+            yield warning("check.parameter-undeclared", at, message)
+
+
+def _own_supervision(node: Node) -> dict[str, object]:
+    """Return what is written at the node itself."""
+    written = node.positions.keys() - node.shared
+    return {key: getattr(node.supervision, key) for key in SUPERVISION_KEYS if key in written}
+
+
+def flat_parameters(
+    entries: Iterable[tuple[str, Document]], found: Findings
+) -> dict[str, tuple[ParameterValue, Position]]:
+    """Return values by dotted name, as rcl's files have them, and where each is written."""
+    flat: dict[str, tuple[ParameterValue, Position]] = {}
+    pending = list(reversed(list(entries)))
+    while pending:
+        name, part = pending.pop()
+        if isinstance(part.root.data, dict):
+            inner = [(f"{name}.{key}", each) for key, each in part.entries()]
+            pending.extend(reversed(inner))
+            continue
+        if name in flat:
+            message = f"cannot set the parameter {name!r} twice"
+            first = flat[name][1]
+            hint = f"the first value stands at {first.spelled}"
+            found.append(error("manifest.duplicate-parameter", part.at(), message, hint))
+            continue
+        value = parameter_value(name, part, found)
+        if value is not None:
+            flat[name] = (value, part.key_at())
+    return flat
+
+
+def parameter_value(name: str, part: Document, found: Findings) -> ParameterValue | None:
+    """Return the value of a parameter or argument; None after reporting that it cannot be one."""
+    if isinstance(part.root.data, tuple):
+        values = part.plain()
+        types = {type(each).__name__: each for each in values}
+        if len(types) <= 1:
+            return tuple(values)
+        names = {"str": "string", "float": "double"}
+        mixed = " and ".join(f"{names.get(type_, type_)} {quote(types[type_])}" for type_ in types)
+        message = f"cannot mix {mixed} in one array; a ROS array holds one type"
+        hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
+        found.append(error("manifest.parameter-array", part.at(), message, hint))
+        return None
+    text = part.root.text
+    if not part.root.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
+        message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
+        hint = f'write {name}: true or false, or {name}: "{text}"'
+        found.append(note("manifest.yaml-1.1-boolean", part.at(), message, hint))
+    if not part.root.quoted and has_leading_zero(text):
+        message = f"cannot tell which number {text} is meant as; it is read as a string"
+        hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
+        found.append(note("manifest.leading-zero", part.at(), message, hint))
+    return part.scalar
 
 
 def build_on_violation(section: Document) -> OnViolation:
@@ -55,15 +251,13 @@ def build_on_violation(section: Document) -> OnViolation:
     if reactions is None:
         return ()
     data = reactions.root.data
-    if isinstance(data, dict) and [*data] != ["mode"]:
-        return tuple(_reaction(rule, each) for rule, each in reactions.entries())
-    return (_reaction(BY_DEFAULT, reactions),)
-
-
-def _reaction(rule: str, what: Document) -> Reaction:
-    if isinstance(what.root.data, dict):
-        return Reaction(rule=rule, what=Consequence.MODE, mode=what.text("mode"))
-    return Reaction(rule=rule, what=Consequence(what.scalar))
+    by_rule = isinstance(data, dict) and [*data] != ["mode"]
+    return tuple(
+        Reaction(rule=rule, what=Consequence.MODE, mode=each.text("mode"))
+        if isinstance(each.root.data, dict)
+        else Reaction(rule=rule, what=Consequence(each.scalar))
+        for rule, each in (reactions.entries() if by_rule else ((BY_DEFAULT, reactions),))
+    )
 
 
 _NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
@@ -86,40 +280,29 @@ def positions_of(section: Document, keys: Iterable[str]) -> dict[str, Position]:
     return found
 
 
-def build_connections(
-    node: Document, interface: Interface, found: list[Diagnostic]
-) -> tuple[ConnectionDeclaration, ...]:
-    """Build the connections of a node; `map: all` expands to its interface."""
-    return tuple(
-        ConnectionDeclaration(
-            name=name,
-            urls=tuple(url for part in each.items("urls") if (url := _url(part, found))),
-            map=_map(each, interface),
-            at=each.key_at(),
+def _connections(
+    node: Document, interface: Interface, found: Findings
+) -> Iterator[ConnectionDeclaration]:
+    """Yield the connections of a node; `map: all` expands to its interface."""
+    for name, each in node.entries("connections"):
+        urls = []
+        for url in each.items("urls"):
+            try:
+                urls.append(parse(url.root.text))
+            except ConnectionUrlError as problem:  # noqa: PERF203 - each is reported
+                rule = "manifest.connection-url"
+                found.append(error(rule, url.at(), problem.message, problem.hint))
+        if each.text("map") == "all":
+            carried = [(endpoint.kind, endpoint.name) for endpoint in interface.endpoints]
+        else:
+            kinds = ((EndpointKind(kind), names) for kind, names in each.entries("map"))
+            carried = [(kind, one.root.text) for kind, names in kinds for one in names.items()]
+        yield ConnectionDeclaration(
+            name=name, urls=tuple(urls), map=tuple(carried), at=each.key_at()
         )
-        for name, each in node.entries("connections")
-    )
 
 
-def _url(part: Document, found: list[Diagnostic]) -> ConnectionUrl | None:
-    try:
-        return parse(part.root.text)
-    except ConnectionUrlError as problem:
-        found.append(error("manifest.connection-url", part.at(), problem.message, problem.hint))
-        return None
-
-
-def _map(connection: Document, interface: Interface) -> tuple[tuple[EndpointKind, str], ...]:
-    if connection.text("map") == "all":
-        return tuple((each.kind, each.name) for each in interface.endpoints)
-    return tuple(
-        (EndpointKind(kind), each.root.text)
-        for kind, names in connection.entries("map")
-        for each in names.items()
-    )
-
-
-def build_interface(
+def _interface(
     node: Document, *, base: Path, environment: Mapping[str, str], found: Findings
 ) -> Interface:
     """Build the interface of a node, inline or by reference; empty if it has none."""
@@ -153,8 +336,9 @@ def build_node(
         found: where findings go.
     """
     node = read_part(part, written.Node)
-    parameters = build_parameters(part, found)
-    interface = build_interface(part, base=base, environment=environment, found=found)
+    parameters = flat_parameters(part.entries("parameters"), found)
+    folder = node.run.working_directory if node.run else None
+    interface = _interface(part, base=base, environment=environment, found=found)
     built = build(
         Node,
         node,
@@ -172,9 +356,12 @@ def build_node(
         on_violation=build_on_violation(part),
         interface=interface,
         flows=tuple(_flows(part)),
-        connections=build_connections(part, interface, found),
+        connections=tuple(_connections(part, interface, found)),
         positions=positions_of(part, {key for key, _ in part.entries()} - {"interface"}),
-        written_paths=tuple(_written_paths(node)),
+        written_paths=(
+            *((f"parameter_files.{i}", each) for i, each in enumerate(node.parameter_files)),
+            *((("run.working_directory", folder),) if folder else ()),
+        ),
         at=part.key_at(),
     )
     return shared.given_to(built)
@@ -213,25 +400,39 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     if part is None:
         return Run(kind=RunKind.ATTACH)
     run = read_part(part, written.Run)
-    kind = RunKind.COMMAND
+    kind = RunKind.ATTACH if run.component or run.attach else RunKind.COMMAND
+    meaningless: list[tuple[str, tuple[str, ...], str]] = []
     if run.python:
-        kind = RunKind.PYTHON
-        _refuse(part, ("ros_args",), "a Python class: our host gives it no command line", found)
-    elif run.component:
-        kind = RunKind.ATTACH
-        _refuse(part, PROCESS_KEYS, "a component: its container's process has that", found)
-    elif run.attach:
-        kind = RunKind.ATTACH
-        _refuse(part, PROCESS_KEYS, "an attached node", found)
+        kind, what = RunKind.PYTHON, "a Python class: our host gives it no command line"
+        meaningless.append(("manifest.attach", ("ros_args",), what))
+    elif kind is RunKind.ATTACH:
+        what = "an attached node"
+        if run.component:
+            what = "a component: its container's process has that"
+        meaningless.append(("manifest.attach", PROCESS_KEYS, what))
     if not run.component:
-        _refuse(part, ("extra_arguments",), "what is no component", found)
+        meaningless.append(("manifest.attach", ("extra_arguments",), "what is no component"))
     if kind is not RunKind.PYTHON:
-        rule = "manifest.python-only"
-        _refuse(part, _OF_PYTHON, "what is not 'run: {python: …}'", found, rule=rule)
+        what = "what is not 'run: {python: …}'"
+        meaningless.append(("manifest.python-only", _OF_PYTHON, what))
     elif run.threads and run.executor is not Executor.MULTI:
         message = "cannot give threads to an executor that has one"
         hint = "write 'executor: multi', or remove it"
         found.append(error("manifest.threads", part.key_at(("threads",)), message, hint))
+    for rule, keys, what in meaningless:
+        at = {key: part.key_at((key,)) for key in keys if key in part}
+        found += [error(rule, at[key], f"cannot set {key} of {what}", "remove it") for key in at]
+    resources = run.resources
+    if resources is not None and resources.memory_high_mib and resources.memory_max_mib:
+        high, most = resources.memory_high_mib, resources.memory_max_mib
+        if high >= most:
+            at_high = part.key_at(("resources", "memory_high_mib"))
+            message = (
+                f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
+            )
+            hint = "set it lower, or leave it out"
+            found.append(error("manifest.resources", at_high, message, hint))
+    container = run.container or ""
     return build(
         Run,
         run,
@@ -242,45 +443,15 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
         environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
         working_directory=absolute(base, run.working_directory) if run.working_directory else "",
         prefix=tuple(each.root.text for each in part.items("prefix")),
-        resources=_resources(part, run, found),
-        container=_container(run.container or "", shared),
+        resources=resources and build(Resources, resources, at=part.key_at(("resources",))),
+        # A full name, or the key of a node of the system.
+        container=container if container[:1] in ("", "/") else shared.key(container),
     )
-
-
-def _container(name: str, shared: Shared) -> str:
-    """Return the container of a component: a full name, or the key of a node of the system."""
-    return name if not name or name.startswith("/") else shared.key(name)
-
-
-def _resources(part: Document, run: written.Run, found: Findings) -> Resources | None:
-    if run.resources is None:
-        return None
-    high, most = run.resources.memory_high_mib, run.resources.memory_max_mib
-    if high is not None and most is not None and high >= most:
-        at = part.key_at(("resources", "memory_high_mib"))
-        message = f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
-        found.append(error("manifest.resources", at, message, "set it lower, or leave it out"))
-    return build(Resources, run.resources, at=part.key_at(("resources",)))
 
 
 def _values(run: Document, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
     values = ((name, parameter_value(name, each, found)) for name, each in run.entries(key))
     return tuple((name, value) for name, value in values if value is not None)
-
-
-def _refuse(
-    run: Document,
-    names: tuple[str, ...],
-    what: str,
-    found: Findings,
-    *,
-    rule: str = "manifest.attach",
-) -> None:
-    """Report keys of `run` that have no meaning for this way to run a node."""
-    for name in names:
-        if name in run:
-            message = f"cannot set {name} of {what}"
-            found.append(error(rule, run.key_at((name,)), message, "remove it"))
 
 
 def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
@@ -335,11 +506,3 @@ def quantities(part: Document, keys: MeasuredKeys) -> Iterator[Quantity]:
         yield Quantity(name="rate_hz", value=rate.min or 0.0, most=rate.max, at=at)
     elif rate is not None:
         yield Quantity(name="rate_hz", value=rate, slack=RATE_SLACK, at=at)
-
-
-def _written_paths(node: written.Node) -> Iterator[tuple[str, str]]:
-    """Yield the paths of a node as they are written, by place."""
-    for index, each in enumerate(node.parameter_files):
-        yield f"parameter_files.{index}", each
-    if node.run is not None and node.run.working_directory:
-        yield "run.working_directory", node.run.working_directory

@@ -263,15 +263,11 @@ class FlowNeeds:
             max_delay_ms=delay,
             transports=(udp_to(address),) if by_participant else (),
         )
-        return replace(resolved, max_datagram_bytes=self._max_datagram_bytes(address, resolved))
-
-    def _max_datagram_bytes(self, address: str, each: ResolvedNeed) -> int | None:
-        """Return how small datagrams must be; only a flow that a network knows can be harmed."""
-        if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
-            return None
-        declared = self._manifest.network.max_datagram_bytes
-        limit = declared or max_unfragmented(ipv6=":" in address)
-        size = each.need.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.
-        small = declared is None if size is None else not is_fragmented(size, limit)
-        return None if small else declared or SAFE_DATAGRAM_BYTES
+        size, declared = need.max_message_size, network.max_datagram_bytes
+        limit = declared or max_unfragmented(ipv6=":" in address)
+        is_small = declared is None if size is None else not is_fragmented(size, limit)
+        # Only a flow that a network knows can be harmed.
+        if need.kind is EndpointKind.PUBLISHER and resolved.prioritised and not is_small:
+            return replace(resolved, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
+        return resolved

@@ -13,7 +13,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from lifecycle.errors import nearest
 
@@ -98,23 +97,16 @@ def installed_hash(type_: str, prefixes: Sequence[Path]) -> str:
 
     Empty if the type is not installed here, or by a distribution that has no hashes (before Iron).
     """
-    parts = _PARTS.get(type_.partition("/")[2].partition("/")[0], ())
-    try:
-        listed = _description(type_, prefixes)["type_hashes"]
-        known = {str(each["type_name"]): str(each["hash_string"]) for each in listed}
-    except (KeyError, TypeError):
-        return ""
-    return join([known.get(f"{type_}{part}", "") for part in parts])
-
-
-def _description(type_: str, prefixes: Sequence[Path]) -> Any:
-    """Return what rosidl has installed of a type as JSON; None if it cannot be read."""
     package, _, rest = type_.partition("/")
     index = find_resource(_RESOURCE, package, prefixes) if rest else None
     if index is None:
-        return None
+        return ""
+    # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
+    path = index.parents[3] / package / f"{rest}.json"
     try:
-        # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
-        return json.loads((index.parents[3] / package / f"{rest}.json").read_text("utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return None
+        listed = json.loads(path.read_text("utf-8"))["type_hashes"]
+        known = {str(each["type_name"]): str(each["hash_string"]) for each in listed}
+    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+        return ""
+    parts = _PARTS.get(rest.partition("/")[0], ())
+    return join([known.get(f"{type_}{part}", "") for part in parts])

@@ -85,25 +85,34 @@ def build_inline(interface: Document, found: Findings) -> Interface:
 
 def _endpoint(kind: EndpointKind, part: Document, found: Findings) -> Endpoint:
     preset = _DEFAULT_PRESET.get(kind)
-    written_qos = part.get("qos")
+    qos, left_open = None, tuple[str, ...]()
+    if preset is not None:
+        qos, left_open = _qos(part.get("qos"), PRESETS[preset], found)
     return Endpoint(
         kind=kind,
         name=part.text("name"),
         type=part.text("type"),
-        qos=None if preset is None else _qos(written_qos, PRESETS[preset], found),
-        qos_defaults=() if preset is None else _defaults(written_qos),
+        qos=qos,
+        qos_defaults=left_open,
         at=part.at(),
     )
 
 
-def _qos(part: Document | None, default: QosProfile, found: Findings) -> QosProfile:
-    """Lay what is written over a preset, or over the default of the endpoint's kind."""
+def _qos(
+    part: Document | None, default: QosProfile, found: Findings
+) -> tuple[QosProfile, tuple[str, ...]]:
+    """Lay what is written over a preset, or over the default of the endpoint's kind.
+
+    Returns:
+        The profile, and its policies that are not written; naming a preset writes all of it.
+    """
     if part is None:
-        return default
+        return default, POLICIES
     policies = part.plain()
     if isinstance(policies, str):
-        return PRESETS[policies]
+        return PRESETS[policies], ()
     preset = policies.pop("preset", None)
+    left_open = () if preset else not_written(policies)
     plain = {**msgspec.to_builtins(PRESETS[preset] if preset else default), **policies}
     # rmw and NoDL alike: a duration of zero is none (RMW_DURATION_UNSPECIFIED).
     plain |= {name: each or None for name, each in plain.items() if name.endswith("_ns")}
@@ -113,27 +122,7 @@ def _qos(part: Document | None, default: QosProfile, found: Findings) -> QosProf
     if profile.history is History.KEEP_LAST and profile.depth == 0:
         message = "cannot use depth 0 with KEEP_LAST: it would keep nothing; set depth >= 1"
         found.append(error("manifest.qos", part.at(("depth",)), message))
-    return profile
-
-
-def _defaults(qos: Document | None) -> tuple[str, ...]:
-    """Return the policies that are not written; naming a preset writes all of it."""
-    if qos is None:
-        return POLICIES
-    policies = qos.plain()
-    return () if isinstance(policies, str) or "preset" in policies else not_written(policies)
-
-
-def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclaration:
-    declared = read_part(part, written.Parameter)
-    default = part.get("default_value")
-    return build(
-        ParameterDeclaration,
-        declared,
-        name=name,
-        default=None if default is None else _default(default, declared.type, found),
-        at=part.key_at(),
-    )
+    return profile, left_open
 
 
 _TYPES: Mapping[str, Any] = {
@@ -149,16 +138,16 @@ _TYPES: Mapping[str, Any] = {
 }
 
 
-def _default(part: Document, type_: str, found: Findings) -> ParameterValue | None:
-    """Return a declared default in its declared type; None after reporting that it does not fit."""
-    try:
-        value: ParameterValue = msgspec.convert(part.plain(), _TYPES[type_])
-    except msgspec.ValidationError:
-        shown = quote(part.plain())
-        message = f"cannot use {shown} as default of a parameter of type {type_}"
-        found.append(error("manifest.parameter-default", part.at(), message))
-        return None
-    return value
+def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclaration:
+    declared = read_part(part, written.Parameter)
+    default: ParameterValue | None = None
+    if (value := part.get("default_value")) is not None:
+        try:
+            default = msgspec.convert(value.plain(), _TYPES[declared.type])
+        except msgspec.ValidationError:
+            what = f"{quote(value.plain())} as default of a parameter of type {declared.type}"
+            found.append(error("manifest.parameter-default", value.at(), f"cannot use {what}"))
+    return build(ParameterDeclaration, declared, name=name, default=default, at=part.key_at())
 
 
 NODL_VERSION = 2
@@ -358,43 +347,34 @@ class _NodlReading:
         for what, name, at in entries:
             other = first.setdefault((what, name), at)
             if other is not at:
-                place = f"{other.spelled}"
-                message = f"cannot declare {what} {name!r} twice; the first is at {place}"
+                where = other.spelled
+                message = f"cannot declare {what} {name!r} twice; the first is at {where}"
                 self._error("duplicate", at, message, "remove one")
 
     def _locate(self, reference: str, base: Path, at: Position) -> Path | None:
         scheme, _, body = reference.partition("://")
+        package, _, name = body.partition("/")
         if scheme == "local" and body:
             path = base / body
-            if not os.path.exists(path):
-                message = f"cannot find {reference!r}: there is no file {str(path)!r}"
-                hint = nearest_file(path)
-                self._error("not-found", at, message, hint)
-                return None
-            return path
-        if scheme == "nodl":
-            return self._indexed(reference, body, at)
-        message = f"cannot follow {reference!r}; write local://PATH or nodl://PACKAGE/NAME"
-        self._error("reference", at, message)
-        return None
-
-    def _indexed(self, reference: str, body: str, at: Position) -> Path | None:
-        package, _, name = body.partition("/")
-        if not package or not name or "/" in name:
+            if os.path.exists(path):
+                return path
+            message = f"cannot find {reference!r}: there is no file {str(path)!r}"
+            self._error("not-found", at, message, nearest_file(path))
+        elif scheme != "nodl":
+            message = f"cannot follow {reference!r}; write local://PATH or nodl://PACKAGE/NAME"
+            self._error("reference", at, message)
+        elif not package or not name or "/" in name:
             self._error("reference", at, f"cannot follow {reference!r}; write nodl://PACKAGE/NAME")
-            return None
-        found = find_resource(_RESOURCE, f"{package}__{name}", self._prefixes)
-        if found is None:
-            known = [
-                "nodl://" + each.replace("__", "/", 1)
-                for each in list_resources(_RESOURCE, self._prefixes)
-            ]
+        elif found := find_resource(_RESOURCE, f"{package}__{name}", self._prefixes):
+            return found
+        else:
+            known = list_resources(_RESOURCE, self._prefixes)
+            hint = did_you_mean(reference, [f"nodl://{x.replace('__', '/', 1)}" for x in known])
             message = f"cannot find {reference!r} in the ament index"
-            hint = did_you_mean(reference, known) or (
-                f"source the workspace that installs {package}, so that AMENT_PREFIX_PATH names it"
-            )
+            source = f"source the workspace that installs {package}"
+            hint = hint or f"{source}, so that AMENT_PREFIX_PATH names it"
             self._error("not-found", at, message, hint)
-        return found
+        return None
 
     def _error(self, rule: str, at: Position, message: str, hint: str = "") -> None:
         self.found.append(error(f"nodl.{rule}", at, message, hint))

@@ -8,6 +8,7 @@ all that it finds and is the last one.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -18,11 +19,13 @@ from msgspec.structs import replace
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.building import (
+    Shared,
     build_modes,
     build_node,
     build_on_violation,
     positions_of,
     quantities,
+    settle,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import (
@@ -36,6 +39,7 @@ from lifecycle.manifest.diagnostics import (
     note,
 )
 from lifecycle.manifest.model import (
+    THIS_HOST,
     DataLayer,
     Discovery,
     EndpointKind,
@@ -50,7 +54,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.shared import THIS_HOST, Shared, settle
 from lifecycle.manifest.written import build, read_part
 from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
@@ -169,33 +172,28 @@ def _other_kind(document: Document) -> tuple[str, str] | None:
 
 def _without_left_out(manifest: Manifest) -> Manifest:
     """Return a manifest whose nodes wait for no node that is left out, and links have both ends."""
-    there = {node.key for node in manifest.nodes}
-    exact = {key for key in manifest.left_out if not key.endswith("/")} - there
-    prefixes = tuple(key for key in manifest.left_out if key.endswith("/"))
-
-    def is_left_out(key: str) -> bool:
-        return key not in there and (key in exact or key.startswith(prefixes))
-
     if not manifest.left_out:
         return manifest
-    nodes = tuple(
-        replace(node, after=tuple(each for each in node.after if not is_left_out(each.node)))
+    there = {node.key for node in manifest.nodes}
+    prefixes = tuple(key for key in manifest.left_out if key.endswith("/"))
+
+    def stays(key: str) -> bool:
+        return key in there or not (key in manifest.left_out or key.startswith(prefixes))
+
+    nodes = (
+        replace(node, after=tuple(each for each in node.after if stays(each.node)))
         for node in manifest.nodes
     )
-    links = tuple(
-        link
-        for link in manifest.links
-        if not is_left_out(link.from_node) and not is_left_out(link.to_node)
-    )
-    modes = tuple(
+    links = (link for link in manifest.links if stays(link.from_node) and stays(link.to_node))
+    modes = (
         replace(
             mode,
-            inactive=tuple(key for key in mode.inactive if not is_left_out(key)),
-            parameters=tuple(each for each in mode.parameters if not is_left_out(each.node)),
+            inactive=tuple(filter(stays, mode.inactive)),
+            parameters=tuple(each for each in mode.parameters if stays(each.node)),
         )
         for mode in manifest.modes
     )
-    return replace(manifest, nodes=nodes, links=links, modes=modes)
+    return replace(manifest, nodes=tuple(nodes), links=tuple(links), modes=tuple(modes))
 
 
 SUFFIX = ".lifecycle.yaml"
@@ -269,7 +267,8 @@ class _Loading:
             entry: the include that names it; None for the outermost.
             around: what the including manifests and groups give its nodes.
         """
-        self.files.append(_shown(path))
+        # Bytes that are no UTF-8 could be neither shown nor sent.
+        self.files.append(os.fsencode(path).decode("utf-8", errors="replace"))
         try:
             document = read_document(path, shown=self.files[-1])
         except ManifestError as problem:
@@ -280,7 +279,12 @@ class _Loading:
             message = f"cannot use {what} as a manifest"
             self.found.append(error("manifest.kind", document.at(), message, hint))
             return
-        self._check_suffix(document)
+        if not document.file.endswith(SUFFIX):
+            at = Position(file=document.file, line=1, column=1)
+            name = Path(document.file).name
+            message = f"cannot tell by its name {name!r} that this is a manifest"
+            stem = name.removesuffix(".yaml").removesuffix(".yml")
+            self.found.append(note("manifest.suffix", at, message, f"rename it to {stem}{SUFFIX}"))
         before = len(self.found)
         surroundings = Surroundings(
             environment=self._environment, folder=folder_of(path), programs=self._programs
@@ -363,7 +367,15 @@ class _Loading:
         ]
         for each in root.items("include"):
             if each.place not in reading.left_out:
-                self._include(reading, each, shared)
+                path = _locate(each, reading.chain, self.found)
+                self._documents += path is not None
+                if path is not None and self._documents <= MAX_MANIFESTS:
+                    given = {name: one.root.text for name, one in each.entries("arguments")}
+                    inner = shared.inner(each, self.found)
+                    self.read(path, given, chain=reading.chain, entry=each, around=inner)
+                elif path is not None and self._documents == MAX_MANIFESTS + 1:
+                    message = f"cannot include more than {MAX_MANIFESTS} manifests"
+                    self.found.append(error("manifest.include", each.at(), message))
             elif (prefix := each.text("prefix")) and "$(" not in prefix:
                 left_out.append(f"{prefix}/")
         for each in root.items("groups"):
@@ -389,20 +401,6 @@ class _Loading:
             self.found.append(
                 error("manifest.machine", machine.at, message, "rename one of the two")
             )
-
-    def _include(self, reading: _Reading, entry: Document, shared: Shared) -> None:
-        path = _locate(entry, reading.chain, self.found)
-        if path is None:
-            return
-        self._documents += 1
-        if self._documents > MAX_MANIFESTS:
-            if self._documents == MAX_MANIFESTS + 1:
-                message = f"cannot include more than {MAX_MANIFESTS} manifests"
-                self.found.append(error("manifest.include", entry.at(), message))
-            return
-        given = {name: each.root.text for name, each in entry.entries("arguments")}
-        inner = shared.inner(entry, self.found)
-        self.read(path, given, chain=reading.chain, entry=entry, around=inner)
 
     def _link(self, part: Document, around: Shared) -> Link:
         """Build a link of a document; its topic moves with the document's namespace."""
@@ -437,15 +435,6 @@ class _Loading:
                     return topic_of(node, each.name, kind) or topic
         return topic
 
-    def _check_suffix(self, document: Document) -> None:
-        if not document.file.endswith(SUFFIX):
-            at = Position(file=document.file, line=1, column=1)
-            name = Path(document.file).name
-            message = f"cannot tell by its name {name!r} that this is a manifest"
-            stem = name.removesuffix(".yaml").removesuffix(".yml")
-            hint = f"rename it to {stem}{SUFFIX}"
-            self.found.append(note("manifest.suffix", at, message, hint))
-
 
 def _keys_of(group: Value) -> Iterator[str]:
     """Yield the keys of nodes in a group that is left out; with "/" at the end, a prefix."""
@@ -473,11 +462,6 @@ MAX_MANIFESTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-def _shown(path: Path) -> str:
-    """Return how messages name a file: bytes that are no UTF-8 could be neither shown nor sent."""
-    return os.fsencode(path).decode("utf-8", errors="replace")
-
-
 def _identity(path: Path) -> str:
     """Return a path without links, to recognise a file again."""
     try:
@@ -491,26 +475,20 @@ def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path |
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
     identities = [_identity(each) for each in chain]
-    message, hint = "", ""
+    why, hint = "", ""
     if (identity := _identity(path)) in identities:
         round_trip = [*chain[identities.index(identity) :], path]
-        names = " → ".join(each.name for each in round_trip)
-        message = f"cannot include {quote(name)}: it would include itself, {names}"
+        why = f"it would include itself, {' → '.join(each.name for each in round_trip)}"
     elif len(chain) == MAX_INCLUDE_DEPTH:
-        message = f"cannot include {quote(name)}: at most {MAX_INCLUDE_DEPTH} manifests in a row"
+        why = f"at most {MAX_INCLUDE_DEPTH} manifests in a row"
     elif not os.path.exists(path):
-        message = f"cannot include {quote(name)}: there is no file {quote(str(path), limit=200)}"
-        hint = did_you_mean(path.name, _siblings(path))
+        why = f"there is no file {quote(str(path), limit=200)}"
+        with contextlib.suppress(OSError, ValueError):  # no such folder, or not ours to read
+            hint = did_you_mean(path.name, sorted(each.name for each in path.parent.iterdir()))
     elif path.is_dir():
-        message = f"cannot include {quote(name)}: it is a directory"
-    if not message:
+        why = "it is a directory"
+    if not why:
         return path
+    message = f"cannot include {quote(name)}: {why}"
     found.append(error("manifest.include", entry.at(("manifest",)), message, hint))
     return None
-
-
-def _siblings(path: Path) -> list[str]:
-    try:
-        return sorted(os.listdir(path.parent))  # noqa: PTH208 - names, not paths
-    except (OSError, ValueError):  # no such folder, or not ours to read: there is no suggestion
-        return []

@@ -844,6 +844,10 @@ class Node(NodeDeclaration, frozen=True, kw_only=True):
         return self.positions.get(part, self.at)
 
 
+THIS_HOST = "local"
+"""Name of the machine of nodes that name none; declared implicitly, without address."""
+
+
 class Machine(msgspec.Struct, frozen=True, kw_only=True):
     """A host. `address` is an IPv4 or IPv6 address, or empty for this host."""
 

@@ -315,26 +315,29 @@ def _name(each: ValidationError) -> str:
 
 def _allowed(each: ValidationError) -> tuple[str, str]:
     """Return what the broken keyword allows, and a hint."""
-    if each.validator in _CHOICES:
-        own = (inner for inner in _meant(each.context or ()) if _place(inner) == _place(each))
-        types = [
-            name
-            for inner in own
-            if inner.validator == "type"
-            for name in _listed(inner.validator_value)
-        ]
+    if each.validator in ("type", *_CHOICES):
+        own, types = [each], list[str]()
+        if each.validator != "type":
+            own = [x for x in _meant(each.context or ()) if _place(x) == _place(each)]
+        for inner in own:
+            listed = inner.validator_value if inner.validator == "type" else []
+            types += [listed] if isinstance(listed, str) else listed
         return _types(each, types)
-    if each.validator == "type":
-        return _types(each, _listed(each.validator_value))
     if each.validator in {"enum", "const"}:
         allowed = [each.validator_value] if each.validator == "const" else each.validator_value
-        hint = _closest(each.instance, allowed) or _of_another_key(each)
-        return f"allowed: {_spell(allowed)}", hint
+        spelled = ", ".join(x if isinstance(x, str) else quote(x) for x in allowed)
+        return f"allowed: {spelled}", _closest(each.instance, allowed) or _of_another_key(each)
     if each.validator == "pattern":
         return "", _pattern(each)
-    is_share = each.schema.get("maximum") == 1 and 1 < each.instance <= 100
+    keywords = ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")
+    low, above, high, below = map(each.schema.get, keywords)
+    is_share = high == 1 and 1 < each.instance <= 100
     hint = f"for {each.instance} % write {each.instance / 100:g}" if is_share else ""
-    return f"allowed: {_range(each.schema)}", hint
+    upper = f"less than {below}" if below is not None else f"at most {high}"
+    return (
+        f"allowed: {low} to {high}" if above is None else f"allowed: more than {above}, {upper}",
+        hint,
+    )
 
 
 def _way(each: ValidationError) -> tuple[str, str]:
@@ -426,14 +429,6 @@ def _of_another_key(each: ValidationError) -> str:
     return ""
 
 
-def _range(schema: Mapping[str, Any]) -> str:
-    low, above, high = (schema.get(k) for k in ("minimum", "exclusiveMinimum", "maximum"))
-    below = schema.get("exclusiveMaximum")
-    lower = f"more than {above}" if above is not None else f"{low}"
-    upper = f"less than {below}" if below is not None else f"at most {high}"
-    return f"{lower}, {upper}" if above is not None else f"{lower} to {high}"
-
-
 def _closest(value: object, allowed: list[object]) -> str:
     words = [each for each in allowed if isinstance(each, str)]
     return did_you_mean(value, words) if isinstance(value, str) else ""
@@ -442,11 +437,3 @@ def _closest(value: object, allowed: list[object]) -> str:
 def _pattern(each: ValidationError) -> str:
     pattern = each.schema.get("pattern")
     return str(each.schema.get("patternErrorMessage") or f"it must match {pattern}")
-
-
-def _spell(values: Iterable[object]) -> str:
-    return ", ".join(each if isinstance(each, str) else quote(each) for each in values)
-
-
-def _listed(types: str | list[str]) -> list[str]:
-    return [types] if isinstance(types, str) else types

@@ -6,13 +6,14 @@ and built without an error. Needs no ROS: types are read from the ament index.
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping
 
 from lifecycle.manifest.checks import connections, discovery, flows, nodes, parameters, system
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, in_order
-from lifecycle.manifest.model import Manifest
+from lifecycle.manifest.model import Manifest, Node
 from lifecycle.manifest.parameter_files import ParameterFiles
 
 CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
@@ -23,6 +24,15 @@ CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
     *flows.CHECKS,
     *discovery.CHECKS,
 )
+OF_A_NODE: tuple[Callable[[DeclaredSystem, Node], Iterator[Diagnostic]], ...] = (
+    *system.OF_A_NODE,
+    *connections.OF_A_NODE,
+    *nodes.OF_A_NODE,
+    *parameters.OF_A_NODE,
+    *flows.OF_A_NODE,
+    *discovery.OF_A_NODE,
+)
+"""Those that look at one node after the other."""
 
 
 def check(
@@ -44,4 +54,7 @@ def check(
         environment=os.environ if environment is None else environment,
         files=files or ParameterFiles(manifest.path),
     )
-    return in_order((finding for each in CHECKS for finding in each(declared)), [manifest.path])
+    found = [*itertools.chain(*(each(declared) for each in CHECKS))]
+    for node in manifest.nodes:
+        found += itertools.chain(*(each(declared, node) for each in OF_A_NODE))
+    return in_order(found, [manifest.path])

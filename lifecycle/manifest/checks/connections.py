@@ -18,7 +18,7 @@ from lifecycle.manifest.checks.system import (
     Resolved,
     implicit_names,
 )
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, warning
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.model import (
     Authority,
     ConnectionDeclaration,
@@ -44,152 +44,111 @@ _RULES = {
 
 def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about endpoints that nothing in the manifest connects to."""
-    implicit = implicit_names(system)
+    implicit, policy = implicit_names(system), system.manifest.policy
     unnamed = {endpoint.kind for _, endpoint, _ in system.unresolved}
     for each in system.endpoints:
         kind = each.endpoint.kind
         other = kind.other_end
         if kind not in _RULES or system.named(other, each.name) or (other, each.name) in implicit:
             continue
-        severity = _severity(system, kind)
-        if severity is not None and other not in unnamed:  # it may be the one with the wrong name
-            yield _alone(system, each, other, severity)
-
-
-def _severity(system: DeclaredSystem, kind: EndpointKind) -> Severity | None:
-    policy = system.manifest.policy
-    wanted = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
-    if wanted == "error" and system.is_open:
-        return Severity.WARNING  # the other end may be one that the manifest does not declare
-    return None if wanted == "ignore" else Severity(wanted)
-
-
-def _alone(
-    system: DeclaredSystem, each: Resolved, other: EndpointKind, severity: Severity
-) -> Diagnostic:
-    kind, policy = each.endpoint.kind, "unpublished"
-    if kind is EndpointKind.PUBLISHER:
-        message = f"cannot be heard on {each.name!r}: no node of this system subscribes to it"
-        policy = "unheard"
-    elif kind is EndpointKind.SUBSCRIPTION:
-        message = f"cannot receive anything on {each.name!r}: no node of this system publishes it"
-    else:
-        message = f"cannot call {each.name!r}: no node of this system is its {other.noun}"
-    hint = did_you_mean(each.name, system.names(other)) or (
-        f"'policy: {{{policy}: ignore}}' accepts it"
-    )
-    return Diagnostic(rule=_RULES[kind], severity=severity, at=each.at, message=message, hint=hint)
+        key, wanted = "unpublished", policy.unpublished
+        if kind is EndpointKind.PUBLISHER:
+            key, wanted = "unheard", policy.unheard
+            message = f"cannot be heard on {each.name!r}: no node of this system subscribes to it"
+        elif kind is EndpointKind.SUBSCRIPTION:
+            why = "no node of this system publishes it"
+            message = f"cannot receive anything on {each.name!r}: {why}"
+        else:
+            message = f"cannot call {each.name!r}: no node of this system is its {other.noun}"
+        if wanted == "ignore" or other in unnamed:  # it may be the one with the wrong name
+            continue
+        # Of an open system the other end may be one that the manifest does not declare.
+        make = warning if wanted == "warning" or system.is_open else error
+        accept = f"'policy: {{{key}: ignore}}' accepts it"
+        hint = did_you_mean(each.name, system.names(other)) or accept
+        yield make(_RULES[kind], each.at, message, hint)
 
 
 _FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
 
 
-def check_connections(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about every declared connection, but for its URLs."""
-    hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
-    for node in system.manifest.nodes:
-        yield from _endpoints(node)
-        if node.connections:
-            yield from _foreign(system, node)
-        for each in node.connections:
-            yield from _name(system, node, each, hidden)
-            yield from _lossy(node, each, system)
-
-
-def _foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    if node.run.kind is RunKind.PYTHON:
-        return
-    at = node.where(f"connections.{node.connections[0].name}")
+def check_foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield a finding about connections of a node that makes its participants itself."""
     supervised = system.manifest.data_layer.authority is Authority.SUPERVISOR
-    if supervised and node.managed:
-        return  # its ~/connect_to service is called, if it has one
+    if not node.connections or node.run.kind is RunKind.PYTHON or (supervised and node.managed):
+        return  # of a managed one its ~/connect_to service is called, if it has one
     message = f"cannot connect {node.key!r}: its participants are its own code's to make"
-    hint = "write it as 'run: {python: module:Class}'" + (
-        ""
-        if supervised
-        else ", or use 'data_layer: {authority: supervisor}' if it has ~/connect_to"
-    )
+    hint = "write it as 'run: {python: module:Class}'"
+    if not supervised:
+        hint += ", or use 'data_layer: {authority: supervisor}' if it has ~/connect_to"
+    at = node.where(f"connections.{node.connections[0].name}")
     yield error("check.connection-foreign", at, message, hint)
 
 
-def _endpoints(node: Node) -> Iterator[Diagnostic]:
+def check_mapped(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Judge what the connections of a node carry."""
+    rule = "check.connection-endpoint"
     declared = {(each.kind, each.name) for each in node.interface.endpoints}
     first: dict[tuple[EndpointKind, str], tuple[str, Position]] = {}
     for connection in node.connections:
         counts: dict[EndpointKind, int] = {}
         for kind, name in connection.map:
-            index = counts.get(kind, 0)
-            counts[kind] = index + 1
+            index = counts[kind] = counts.get(kind, -1) + 1
             place = f"connections.{connection.name}.map"
-            at = node.where(f"{place}.{kind.value}.{index}")
-            if at is node.at:
-                at = node.where(place)
-            if (kind, name) not in declared:
-                known = [each for other, each in declared if other is kind]
-                message = (
-                    f"cannot map {kind.noun} {name!r} onto {connection.name!r}: {node.key!r} "
-                    "declares no such endpoint"
-                )
-                hint = did_you_mean(name, known)
-                if not hint:
-                    hint = f"declared: {', '.join(sorted(known)) or 'none'}"
-                opened = node.endpoints is EndpointPolicy.OPEN
-                yield (warning if opened else error)("check.connection-endpoint", at, message, hint)
-                continue
+            at = node.positions.get(f"{place}.{kind.value}.{index}", node.where(place))
+            what = f"cannot map {kind.noun} {name!r} onto {connection.name!r}"
             other, there = first.setdefault((kind, name), (connection.name, at))
-            if there is not at:
-                message = (
-                    f"cannot map {kind.noun} {name!r} onto {connection.name!r}: it is mapped "
-                    f"onto {other!r} ({there.spelled})"
-                )
+            if (kind, name) not in declared:
+                known = sorted(each for of, each in declared if of is kind)
+                message = f"{what}: {node.key!r} declares no such endpoint"
+                hint = did_you_mean(name, known) or f"declared: {', '.join(known) or 'none'}"
+                opened = node.endpoints is EndpointPolicy.OPEN
+                yield (warning if opened else error)(rule, at, message, hint)
+            elif there is not at:
+                message = f"{what}: it is mapped onto {other!r} ({there.spelled})"
                 hint = "one connection may have several URLs: put them together"
-                yield error("check.connection-endpoint", at, message, hint)
+                yield error(rule, at, message, hint)
 
 
-def _name(
-    system: DeclaredSystem,
-    node: Node,
-    connection: ConnectionDeclaration,
-    hidden: dict[str, tuple[Node, ConnectionDeclaration]],
-) -> Iterator[Diagnostic]:
-    reserved = ""
-    if _FLOW_NAME.match(connection.name):
-        reserved = "it names a participant that tells a flow apart"
-    mode = system.manifest.discovery.mode
-    if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
-        reserved = "in discovery mode static_endpoints it carries every topic"
-    if reserved:
-        message = f"cannot name a connection {connection.name!r}: {reserved}"
-        yield error("check.connection-name", connection.at, message, "choose another name")
-    namespace, _, base = node.full_name.rpartition("/")
-    name = f"{namespace}/_{base}_{connection.name}"
-    owner, other = hidden.setdefault(name, (node, connection))
-    if other is not connection:
-        message = (
-            f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
-            f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
-            f"({other.at.spelled})"
-        )
-        yield error("check.connection-name", connection.at, message, "choose another name")
+def check_connection_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about names of connections that something else has."""
+    rule, mode = "check.connection-name", system.manifest.discovery.mode
+    hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
+    declared = ((node, each) for node in system.manifest.nodes for each in node.connections)
+    for node, connection in declared:
+        reserved = ""
+        if _FLOW_NAME.match(connection.name):
+            reserved = "it names a participant that tells a flow apart"
+        if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
+            reserved = "in discovery mode static_endpoints it carries every topic"
+        if reserved:
+            message = f"cannot name a connection {connection.name!r}: {reserved}"
+            yield error(rule, connection.at, message, "choose another name")
+        namespace, _, base = node.full_name.rpartition("/")
+        name = f"{namespace}/_{base}_{connection.name}"
+        owner, other = hidden.setdefault(name, (node, connection))
+        if other is not connection:
+            message = (
+                f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
+                f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
+                f"({other.at.spelled})"
+            )
+            yield error(rule, connection.at, message, "choose another name")
 
 
-def _lossy(
-    node: Node, connection: ConnectionDeclaration, system: DeclaredSystem
-) -> Iterator[Diagnostic]:
+def check_lossy(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Judge data that must arrive against the connection that carries them."""
-    if not all(url.transport.is_group for url in connection.urls):
-        return
-    for kind, name in connection.map:
-        each = system.needs.of(node.key, kind, name)
-        if each is None or each.need.lossy is not False:
-            continue
-        message = (
-            f"cannot carry {kind.noun} {name!r}, whose data are declared not lossy, by multicast "
-            f"alone, as connection {connection.name!r} does"
-        )
-        hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
-        yield error("check.connection-flow", each.need.at, message, hint)
+    for connection in node.connections:
+        groups_only = all(url.transport.is_group for url in connection.urls)
+        for kind, name in connection.map if groups_only else ():
+            each = system.needs.of(node.key, kind, name)
+            if each is not None and each.need.lossy is False:
+                message = (
+                    f"cannot carry {kind.noun} {name!r}, whose data are declared not lossy, by "
+                    f"multicast alone, as connection {connection.name!r} does"
+                )
+                hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
+                yield error("check.connection-flow", each.need.at, message, hint)
 
 
 _MANUAL = "MANUAL_BY_TOPIC"
@@ -267,55 +226,36 @@ def _remedy(each: Incompatibility) -> str:
 
 
 def check_types(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about types."""
-    yield from _missing(system)
-    for family in ("topic", "service", "action"):
-        by_name: dict[str, list[Resolved]] = {}
-        for each in system.endpoints:
-            if each.endpoint.kind.meets_in == family:
-                by_name.setdefault(each.name, []).append(each)
-        for name, ends in by_name.items():
-            yield from _mismatches(family, name, ends)
-
-
-def _missing(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about types that do not exist, and differ at the ends of one name."""
     types_of = functools.cache(lambda package: installed_types.types_of(package, system.prefixes))
     absent: set[str] = set()
-    for node in system.manifest.nodes:
-        for endpoint in node.interface.endpoints:
-            type_ = endpoint.type
-            package, _, name = type_.partition("/")
-            types = types_of(package)
-            if package in absent or (types is not None and name in types):
-                continue
-            nearest = installed_types.nearest_type(type_, system.prefixes)
-            hint = f"did you mean {nearest!r}?" if nearest else ""
-            if types is not None:
-                message = f"cannot find type {type_!r}: package {package!r} has no such type"
-                yield error("check.type-unknown", endpoint.at, message, hint)
-            else:
-                # Once per package: the answer is the same for all of its types.
-                absent.add(package)
-                message = f"cannot tell whether {type_!r} exists: {package!r} is not installed here"
-                yield warning("check.type-not-installed", endpoint.at, message, hint)
-
-
-def _mismatches(family: str, name: str, ends: list[Resolved]) -> Iterator[Diagnostic]:
-    first = ends[0]
-    for each in ends[1:]:
-        if each.endpoint.type != first.endpoint.type:
+    endpoints = (each for node in system.manifest.nodes for each in node.interface.endpoints)
+    for endpoint in endpoints:
+        type_ = endpoint.type
+        package, _, name = type_.partition("/")
+        types = types_of(package)
+        if package in absent or (types is not None and name in types):
+            continue
+        nearest = installed_types.nearest_type(type_, system.prefixes)
+        hint = f"did you mean {nearest!r}?" if nearest else ""
+        if types is not None:
+            message = f"cannot find type {type_!r}: package {package!r} has no such type"
+            yield error("check.type-unknown", endpoint.at, message, hint)
+        else:
+            # Once per package: the answer is the same for all of its types.
+            absent.add(package)
+            message = f"cannot tell whether {type_!r} exists: {package!r} is not installed here"
+            yield warning("check.type-not-installed", endpoint.at, message, hint)
+    first: dict[tuple[str, str], Resolved] = {}
+    for each in system.endpoints:
+        family = each.endpoint.kind.meets_in
+        other = first.setdefault((family, each.name), each)
+        if each.endpoint.type != other.endpoint.type:
             message = (
-                f"cannot use type {each.endpoint.type!r} for {family} {name!r}: "
-                f"{first} uses {first.endpoint.type!r}"
+                f"cannot use type {each.endpoint.type!r} for {family} {each.name!r}: "
+                f"{other} uses {other.endpoint.type!r}"
             )
             yield error("check.type-mismatch", each.at, message, "use one type at all ends")
-
-
-_WORDS = {
-    "port": "port",
-    "metatraffic_port": "metatraffic port",
-    "output_port": "output port",
-}
 
 
 class _Use(msgspec.Struct, frozen=True, kw_only=True):
@@ -330,14 +270,11 @@ class _Use(msgspec.Struct, frozen=True, kw_only=True):
     at: Position
 
 
-def check_urls(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the URLs of every declared connection."""
+def check_connection_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about ports in URLs that something else has."""
     uses = list(_uses(system))
     yield from _port_collisions(uses)
     yield from _well_known(system, uses)
-    for node in system.manifest.nodes:
-        for connection in node.connections:
-            yield from _judge_together(node, connection)
 
 
 def _uses(system: DeclaredSystem) -> Iterator[_Use]:
@@ -349,7 +286,8 @@ def _uses(system: DeclaredSystem) -> Iterator[_Use]:
     )
     for node, connection, index, url in urls:
         group = url.transport.is_group
-        for attribute, word in _WORDS.items():
+        for attribute in ("port", "metatraffic_port", "output_port"):
+            word = attribute.replace("_", " ")
             if (port := getattr(url, attribute)) is not None:
                 yield _Use(
                     host=system.manifest.address_of(node.machine),
@@ -404,19 +342,21 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
         yield error("check.connection-ports", use.at, message, hint)
 
 
-def _judge_together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:
+def check_urls(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Judge URLs that one participant cannot have together."""
-    try:
-        check_together(connection.urls)
-    except ConnectionUrlError as refusal:
-        at = node.where(f"connections.{connection.name}")
-        yield error("check.connection-urls", at, refusal.message, refusal.hint)
+    for connection in node.connections:
+        try:
+            check_together(connection.urls)
+        except ConnectionUrlError as refusal:  # noqa: PERF203 - each is reported
+            at = node.where(f"connections.{connection.name}")
+            yield error("check.connection-urls", at, refusal.message, refusal.hint)
 
 
 CHECKS = (
     check_types,
     check_qos,
     check_counterparts,
-    check_connections,
-    check_urls,
+    check_connection_names,
+    check_connection_ports,
 )
+OF_A_NODE = (check_mapped, check_foreign, check_lossy, check_urls)

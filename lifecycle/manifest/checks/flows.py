@@ -27,58 +27,58 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
 
-def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about flow needs, but for transports."""
+def check_mapping(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield a finding about a mapping of priorities that is empty."""
     mapping = system.manifest.network.transport_priority_mapping
     if mapping is not None and mapping.low > mapping.high:
         at = system.manifest.where("network.transport_priority_mapping")
         message = f"cannot map priorities to TOS {mapping.low:#x} … {mapping.high:#x}"
         yield error("check.flow-dscp", at, message, "the highest is below the lowest: swap them")
-    for node in system.manifest.nodes:
-        for each in system.needs.of_node(node):
-            if unknown := [*_endpoint(node, each.need)]:
-                yield from unknown
-                continue  # what else it asks for is of no endpoint
-            yield from _marking(node, each)
-            yield from _class(each)
-            if node.run.kind is not RunKind.PYTHON:
-                yield from _foreign(node, each)
 
 
-def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
-    noun = need.kind.noun
-    declared = [each.name for each in node.interface.endpoints if each.kind is need.kind]
-    if need.name in declared:
-        return
-    other = next(
-        (
-            each.kind
-            for each in node.interface.endpoints
-            if each.name == need.name and each.kind is not need.kind
-        ),
-        None,
-    )
-    hint = did_you_mean(need.name, declared)
+def check_flows(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about flow needs, but for transports."""
+    for each in system.needs.of_node(node):
+        need = each.need
+        endpoint = node.interface.find(need.kind, need.name)
+        if endpoint is None:
+            yield _unknown(node, need)
+            continue  # what else it asks for is of no endpoint
+        given = need.dscp is not None or need.transport_priority is not None
+        # A BEST_EFFORT reader sends no ACKNACK (DDSI-RTPS §8.4.11).
+        qos = endpoint.qos
+        is_best_effort = qos is not None and qos.reliability is Reliability.BEST_EFFORT
+        if given and need.kind is EndpointKind.SUBSCRIPTION and is_best_effort:
+            message = (
+                f"cannot mark anything that subscription {need.name!r} sends with a DSCP: it is "
+                f"BEST_EFFORT and acknowledges nothing"
+            )
+            hint = "make it RELIABLE, or mark the publishers of the topic"
+            yield note("check.flow-dscp", need.at, message, hint)
+        if each.priority is not None:
+            yield from _priority(need, each.priority)
+        message, hint = each.flow_class.problem
+        if message:
+            yield error("check.flow-five-qi", need.at, message, hint)
+        for issue in () if message else each.flow_class.issues:
+            make = error if issue.field in _KEPT_BY_CLASS else note
+            hint = "choose another class, or write 'five_qi: auto'"
+            yield make("check.five-qi-class", need.at, issue.message, hint)
+        if node.run.kind is not RunKind.PYTHON:
+            yield from _foreign(node, each)
+
+
+def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
+    """Say that a node does not declare the endpoint of a need."""
+    noun, endpoints = need.kind.noun, node.interface.endpoints
+    other = next((each.kind for each in endpoints if each.name == need.name), None)
+    hint = did_you_mean(need.name, [each.name for each in endpoints if each.kind is need.kind])
     if other is not None and other.is_topic:
         hint = f"it is a {other.noun}: move it to 'flows.{other.value}'"
     elif other is not None:
         hint = f"it is a {other.noun}; only publishers and subscriptions have flow needs"
     message = f"cannot ask a flow of {noun} {need.name!r}: {node.key!r} declares no such {noun}"
-    yield error("check.flow-unknown-endpoint", need.at, message, hint)
-
-
-def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    need = each.need
-    given = need.dscp is not None or need.transport_priority is not None
-    if given and need.kind is EndpointKind.SUBSCRIPTION and _is_best_effort(node, need):
-        message = (
-            f"cannot mark anything that subscription {need.name!r} sends with a DSCP: it is "
-            f"BEST_EFFORT and acknowledges nothing"
-        )
-        hint = "make it RELIABLE, or mark the publishers of the topic"
-        yield note("check.flow-dscp", need.at, message, hint)
-    if each.priority is not None:
-        yield from _priority(need, each.priority)
+    return error("check.flow-unknown-endpoint", need.at, message, hint)
 
 
 def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
@@ -108,25 +108,6 @@ def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
         )
         hint = f"what is left is {describe(mapped.tos >> 2)}"
         yield note("check.transport-priority", need.at, message, hint)
-
-
-def _is_best_effort(node: Node, need: FlowNeed) -> bool:
-    """Whether a reader sends no ACKNACK: a BEST_EFFORT one never does (DDSI-RTPS §8.4.11)."""
-    endpoint = node.interface.find(need.kind, need.name)
-    qos = None if endpoint is None else endpoint.qos
-    return qos is not None and qos.reliability is Reliability.BEST_EFFORT
-
-
-def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
-    need, class_ = each.need, each.flow_class
-    message, hint = class_.problem
-    if message:
-        yield error("check.flow-five-qi", need.at, message, hint)
-        return
-    for issue in class_.issues:
-        make = error if issue.field in _KEPT_BY_CLASS else note
-        hint = "choose another class, or write 'five_qi: auto'"
-        yield make("check.five-qi-class", need.at, issue.message, hint)
 
 
 def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -166,9 +147,10 @@ def check_links(system: DeclaredSystem) -> Iterator[Diagnostic]:
             *_end(system, link, link.from_node, EndpointKind.PUBLISHER),
             *_end(system, link, link.to_node, EndpointKind.SUBSCRIPTION),
         ]
-        problems = [each for each in ends if isinstance(each, Diagnostic)]
         resolved = [each for each in ends if isinstance(each, Resolved)]
-        yield from problems or _uniqueness(link, resolved, system)
+        yield from (each for each in ends if isinstance(each, Diagnostic))
+        if resolved == ends:
+            yield from _uniqueness(link, resolved, system)
 
 
 def _end(
@@ -180,20 +162,15 @@ def _end(
         hint = did_you_mean(key, system.nodes)
         yield error("check.link-unknown-node", link.at, message, hint)
         return
-    found = [each for each in system.named(kind, link.topic) if each.node.key == key]
-    if found:
+    others = system.named(kind, link.topic)
+    if found := [each for each in others if each.node.key == key]:
         yield from found
         return
-    topics = [
-        each.name
-        for each in system.endpoints
-        if each.endpoint.kind is kind and each.node.key == key
-    ]
-    message = f"cannot link {link.topic!r}: node {key!r} does not {_VERBS[kind]} it"
-    others = sorted({each.node.key for each in system.named(kind, link.topic)})
-    hint = did_you_mean(link.topic, topics)
+    own = [each.name for each in system.by_node.get(key, ()) if each.endpoint.kind is kind]
+    hint = did_you_mean(link.topic, own)
     if not hint and others:
-        hint = f"node {', '.join(repr(each) for each in others)} does"
+        hint = f"node {', '.join(map(repr, sorted({each.node.key for each in others})))} does"
+    message = f"cannot link {link.topic!r}: node {key!r} does not {_VERBS[kind]} it"
     yield error("check.link-topic", link.at, message, hint)
 
 
@@ -202,25 +179,23 @@ def _uniqueness(link: Link, ends: list[Resolved], system: DeclaredSystem) -> Ite
 
     *Unique Network Flows*: a flow is strongly unique if both NFEs are unique, weakly if one is.
     """
-    silent = [each for each in ends if not _asks(each, system)]
+    silent, is_marked = list[Resolved](), False
+    for each in ends:
+        need = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+        if need is None or need.need.unique is UniqueRequirement.NOT_REQUIRED:
+            silent.append(each)
+        # A marked publisher has sockets beside its node's: whether alone is seen when it runs.
+        is_publisher = each.endpoint.kind is EndpointKind.PUBLISHER
+        is_marked |= need is not None and need.dscp is not None and is_publisher
+    flow = f"cannot make the flow of {link.topic!r} {link.unique.value} unique"
     if link.unique is UniqueHow.STRONGLY:
         for each in silent:
-            message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
+            message = f"{flow}: {_end_name(each)} does not ask to be unique"
             yield error("check.link-not-unique", link.at, message, _remedy(each))
-    # A marked publisher has sockets beside its node's: whether alone is seen when it runs.
-    marked = any(
-        (need := _need(each, system)) is not None and need.dscp is not None
-        for each in ends
-        if each.endpoint.kind is EndpointKind.PUBLISHER
-    )
-    if link.unique is UniqueHow.WEAKLY and len(silent) == len(ends) and not marked:
-        names = " nor ".join(_end_name(each) for each in ends)
-        message = f"{_flow(link)}: neither {names} asks to be unique"
+    if link.unique is UniqueHow.WEAKLY and silent == ends and not is_marked:
+        names = " nor ".join(map(_end_name, ends))
+        message = f"{flow}: neither {names} asks to be unique"
         yield error("check.link-not-unique", link.at, message, _remedy(ends[-1]))
-
-
-def _flow(link: Link) -> str:
-    return f"cannot make the flow of {link.topic!r} {link.unique.value} unique"
 
 
 def _end_name(each: Resolved) -> str:
@@ -232,15 +207,6 @@ def _remedy(each: Resolved) -> str:
         f"add '{each.endpoint.name}: {{unique: strictly_required}}' to "
         f"nodes.{each.node.key}.flows.{each.endpoint.kind.value}"
     )
-
-
-def _need(each: Resolved, system: DeclaredSystem) -> ResolvedNeed | None:
-    return system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-
-
-def _asks(each: Resolved, system: DeclaredSystem) -> bool:
-    resolved = _need(each, system)
-    return resolved is not None and resolved.need.unique is not UniqueRequirement.NOT_REQUIRED
 
 
 _NUMBER = "check.flow-number"
@@ -320,8 +286,5 @@ def _hertz(rate: Quantity) -> float:
     return rate.most or rate.value
 
 
-CHECKS = (
-    check_flows,
-    check_links,
-    check_numbers,
-)
+CHECKS = (check_mapping, check_links, check_numbers)
+OF_A_NODE = (check_flows,)

@@ -16,7 +16,6 @@ from lifecycle.manifest.model import (
     Consequence,
     EndpointPolicy,
     Node,
-    Reaction,
     Readiness,
     ReadyBy,
     Restart,
@@ -35,16 +34,13 @@ from lifecycle.manifest.names import (
 from lifecycle.manifest.parameter_values import is_implicit, misfit, suggestion
 
 
-def check_machines(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about nodes on machines that are not declared."""
+def check_machine(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield a finding about a node on a machine that is not declared."""
     declared = [each.name for each in system.manifest.machines]
-    for node in system.manifest.nodes:
-        if node.machine not in declared:
-            message = (
-                f"cannot run {node.key!r} on machine {node.machine!r}: there is no such machine"
-            )
-            hint = did_you_mean(node.machine, declared) or "declare it under 'machines:'"
-            yield error("check.unknown-machine", node.where("machine"), message, hint)
+    if node.machine not in declared:
+        message = f"cannot run {node.key!r} on machine {node.machine!r}: there is no such machine"
+        hint = did_you_mean(node.machine, declared) or "declare it under 'machines:'"
+        yield error("check.unknown-machine", node.where("machine"), message, hint)
 
 
 def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -71,13 +67,6 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield from _apart(node, other, at)
 
 
-def _of_process(run: Run, key: str) -> object:
-    """Return what a node asks of its process, to be compared with what another asks of it."""
-    if key == "executor":
-        return run.executor, run.threads
-    return dict(run.environment) if key == "environment" else getattr(run, key)
-
-
 def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
     """Judge two nodes that share a process."""
     together = f"cannot share process {node.process!r} with {other.key!r} ({other.at.spelled})"
@@ -92,88 +81,81 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
         hint = "a process that is one command has it at each of its nodes"
         yield error("check.process-run", at, message, hint)
         return
-    for name in (*PROCESS_KEYS, "executor"):
-        if _of_process(one, name) == _of_process(two, name):
-            continue
-        message = f"{together}: a process has one {name}, these nodes ask for two"
-        yield error("check.process-environment", at, message, f"give both the same 'run.{name}'")
+    asked = {name: (getattr(one, name), getattr(two, name)) for name in PROCESS_KEYS}
+    asked["environment"] = (dict(one.environment), dict(two.environment))
+    asked["executor"] = ((one.executor, one.threads), (two.executor, two.threads))
+    for name, (here, there) in asked.items():
+        if here != there:
+            message = f"{together}: a process has one {name}, these nodes ask for two"
+            hint = f"give both the same 'run.{name}'"
+            yield error("check.process-environment", at, message, hint)
     for key in SUPERVISION_KEYS:
         if getattr(node.supervision, key) != getattr(other.supervision, key):
             message = f"{together}: a process has one {key}, these nodes ask for two"
             yield error("check.restart", node.where(key), message, f"write '{key}' at one of them")
 
 
-def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about what is to be done when processes fail."""
-    restarted = {
-        node.process_name: None
-        for node in system.manifest.nodes
-        if node.supervision.restart is not Restart.NO
-    }
-    for node in system.manifest.nodes:
-        places = node.positions
-        own = [key for key in SUPERVISION_KEYS if key in places and key not in node.shared]
-        if node.run.kind is RunKind.ATTACH:
-            what = "it has its container's process" if node.run.component else "others start it"
-            for key in own:
-                message = f"cannot set {key} of {node.key!r}: {what}"
-                hint = "set it at the container" if node.run.component else "remove it"
-                yield error("check.restart", places[key], message, hint)
-            continue
-        if node.process_name not in restarted:
-            for key in own:
-                if key != "restart":
-                    message = f"cannot use {key} of {node.key!r}: it is not started again"
-                    yield error("check.restart", places[key], message, _NOT_RESTARTED)
-            continue
-        if node.may_end and "restart" in own and node.supervision.restart is Restart.ALWAYS:
+def check_supervision(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about what is to be done when the process of a node fails."""
+    own = [key for key in SUPERVISION_KEYS if key in node.positions and key not in node.shared]
+    how, hint = node.supervision, "write 'restart: on-failure', or remove it"
+    if node.run.kind is RunKind.ATTACH:
+        what = "it has its container's process" if node.run.component else "others start it"
+        for key in own:
+            message = f"cannot set {key} of {node.key!r}: {what}"
+            hint = "set it at the container" if node.run.component else "remove it"
+            yield error("check.restart", node.where(key), message, hint)
+    elif how.restart is Restart.NO:
+        for key in own:
+            if key != "restart":
+                message = f"cannot use {key} of {node.key!r}: it is not started again"
+                yield error("check.restart", node.where(key), message, hint)
+    else:
+        if node.may_end and "restart" in own and how.restart is Restart.ALWAYS:
             message = f"cannot start {node.key!r} again whenever it ends: it may end by itself"
             hint = "write 'restart: on-failure', or remove 'may_end'"
-            yield error("check.restart", places["restart"], message, hint)
+            yield error("check.restart", node.where("restart"), message, hint)
         yield from _delays(node)
 
 
-def check_health(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_health(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Yield findings about health that nothing can report."""
-    for node in system.manifest.nodes:
-        if node.health is None:
-            continue
-        at = node.where("health")
-        if not node.health.check and not node.health.diagnostics:
-            message = f"cannot require that {node.key!r} is healthy: nothing says how that is known"
-            yield error("check.health", at, message, "write 'check: true', or remove 'health'")
-        elif node.health.check and not node.managed:
-            message = f"cannot ask {node.key!r} whether it is healthy: it is not managed"
-            hint = "its class must be a lifecycle.LifecycleNode; or name its 'diagnostics'"
-            yield error("check.health", at, message, hint)
+    if node.health is None:
+        return
+    at = node.where("health")
+    if not node.health.check and not node.health.diagnostics:
+        message = f"cannot require that {node.key!r} is healthy: nothing says how that is known"
+        yield error("check.health", at, message, "write 'check: true', or remove 'health'")
+    elif node.health.check and not node.managed:
+        message = f"cannot ask {node.key!r} whether it is healthy: it is not managed"
+        hint = "its class must be a lifecycle.LifecycleNode; or name its 'diagnostics'"
+        yield error("check.health", at, message, hint)
 
 
 def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about violations after which nodes are to be deactivated that never can be."""
-    hint = "write 'pause' or 'stop', which are for the whole system"
-    for node in system.manifest.nodes:
+    """Yield findings about what is done on a violation that cannot be done."""
+    rule, manifest = "check.on-violation", system.manifest
+    modes = [each.name for each in manifest.modes]
+    several = len({node.machine for node in manifest.nodes}) > 1
+    reactions = [
+        (each, manifest.where(f"on_violation.{each.rule}")) for each in manifest.on_violation
+    ]
+    for node in manifest.nodes:
         for each in node.on_violation:
             at = node.where(f"on_violation.{each.rule}")
+            reactions.append((each, at))
             if each.what is Consequence.DEACTIVATE and (why := _never_deactivated(node)):
                 message = f"cannot deactivate {node.key!r} when it violates: {why}"
-                yield error("check.on-violation", at, message, hint)
-            yield from _mode(system, each, at)
-    for each in system.manifest.on_violation:
-        yield from _mode(system, each, system.manifest.where(f"on_violation.{each.rule}"))
-
-
-def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:
-    modes = [each.name for each in system.manifest.modes]
-    if reaction.what is not Consequence.MODE:
-        return
-    if reaction.mode not in modes:
-        message = f"cannot enter mode {reaction.mode!r} on a violation: there is no such mode"
-        hint = did_you_mean(reaction.mode, modes) or "declare it under 'modes:'"
-        yield error("check.on-violation", at, message, hint)
-    elif len({node.machine for node in system.manifest.nodes}) > 1:
-        message = f"cannot enter mode {reaction.mode!r} on a violation: several machines run in it"
-        hint = "write 'deactivate', 'pause' or 'stop'; a mode is switched by one supervisor"
-        yield error("check.on-violation", at, message, hint)
+                hint = "write 'pause' or 'stop', which are for the whole system"
+                yield error(rule, at, message, hint)
+    for each, at in reactions:
+        what = f"cannot enter mode {each.mode!r} on a violation"
+        if each.what is Consequence.MODE and each.mode not in modes:
+            hint = did_you_mean(each.mode, modes) or "declare it under 'modes:'"
+            yield error(rule, at, f"{what}: there is no such mode", hint)
+        elif each.what is Consequence.MODE and several:
+            hint = "write 'deactivate', 'pause' or 'stop'; a mode is switched by one supervisor"
+            yield error(rule, at, f"{what}: several machines run in it", hint)
 
 
 def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -205,9 +187,6 @@ def _never_deactivated(node: Node) -> str:
         return "no gate holds it"
     kept = node.state is not TargetState.ACTIVE
     return f"it is kept {node.state.value}" if kept else ""
-
-
-_NOT_RESTARTED = "write 'restart: on-failure', or remove it"
 
 
 def _delays(node: Node) -> Iterator[Diagnostic]:
@@ -251,81 +230,66 @@ def _program(run: Run) -> str:
     return shlex.join(run.command) if run.command else f"{run.executable} of {run.package}"
 
 
-def check_programs(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about what is asked of programs that cannot be had."""
-    for node in system.manifest.nodes:
-        yield from _not_given(node)
-        if node.run.component:
-            yield from _container(node, system)
-        if node.may_end and node.managed:
-            message = f"cannot let {node.key!r} end by itself: a managed node is ended by its gate"
-            yield error("check.may-end", node.where("may_end"), message, "write 'managed: false'")
-        elif node.may_end and node.run.kind is not RunKind.COMMAND:
-            message = f"cannot see how {node.key!r} ends: it is not a command that we start"
-            yield error("check.may-end", node.where("may_end"), message, "remove it")
-        if node.state is not TargetState.ACTIVE and not node.managed:
-            message = f"cannot keep {node.key!r} {node.state.value}: it is not managed"
-            yield error("check.state", node.where("state"), message, "remove 'state:'")
-        if (
-            node.state is TargetState.UNCONFIGURED
-            and node.run.kind is RunKind.PYTHON
-            and node.interface.endpoints
-        ):
-            message = (
-                f"cannot keep {node.key!r} unconfigured with an interface: a Python node makes its "
-                "endpoints when it connects"
-            )
-            hint = "write 'state: inactive', or 'endpoints: open' and no interface"
-            yield error("check.state", node.where("state"), message, hint)
-
-
-def _not_given(node: Node) -> Iterator[Diagnostic]:
-    """Warn of what a command would be given by the ROS arguments that it must not have."""
-    if node.run.ros_args is not RosArguments.NONE:
-        return
-    asked = [f"remap.{name}" for name, _ in node.remap[:1]]
-    asked += ["log_level"] if node.log_level else []
-    for part in asked:
-        key = part.partition(".")[0]
-        message = f"cannot give {key} to {node.key!r}: it has 'ros_args: none'"
-        hint = "write it into its command line, or 'ros_args: auto'"
-        yield warning("check.ros-args", node.where(part), message, hint)
-
-
-def _container(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
-    name = node.run.container
-    at = node.where("run.container")
-    if name.startswith("/"):
-        if problem := full_name_problem(name):
-            yield error("check.container", at, f"cannot load {node.key!r} into {name!r}: {problem}")
-    elif name not in system.nodes:
-        message = f"cannot load {node.key!r} into {name!r}: there is no such node"
-        hint = did_you_mean(name, system.nodes) or "others' containers have a full name, '/NAME'"
-        yield error("check.container", at, message, hint)
-    elif system.nodes[name].machine != node.machine:
-        other = system.nodes[name]
+def check_program(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about what is asked of a node's program that cannot be had."""
+    if node.run.ros_args is RosArguments.NONE:
+        asked = ["remap"] if node.remap else []
+        for key in [*asked, "log_level"] if node.log_level else asked:
+            at = node.where(f"remap.{node.remap[0][0]}" if key == "remap" else key)
+            message = f"cannot give {key} to {node.key!r}: it has 'ros_args: none'"
+            hint = "write it into its command line, or 'ros_args: auto'"
+            yield warning("check.ros-args", at, message, hint)
+    if node.may_end and node.managed:
+        message = f"cannot let {node.key!r} end by itself: a managed node is ended by its gate"
+        yield error("check.may-end", node.where("may_end"), message, "write 'managed: false'")
+    elif node.may_end and node.run.kind is not RunKind.COMMAND:
+        message = f"cannot see how {node.key!r} ends: it is not a command that we start"
+        yield error("check.may-end", node.where("may_end"), message, "remove it")
+    if node.state is not TargetState.ACTIVE and not node.managed:
+        message = f"cannot keep {node.key!r} {node.state.value}: it is not managed"
+        yield error("check.state", node.where("state"), message, "remove 'state:'")
+    is_python = node.run.kind is RunKind.PYTHON
+    if is_python and node.state is TargetState.UNCONFIGURED and node.interface.endpoints:
         message = (
-            f"cannot load {node.key!r} into {name!r}: it is for machine {node.machine!r}, "
-            f"{name!r} runs on {other.machine!r}"
+            f"cannot keep {node.key!r} unconfigured with an interface: a Python node makes its "
+            "endpoints when it connects"
         )
-        yield error("check.container", at, message, "put both on one machine")
+        hint = "write 'state: inactive', or 'endpoints: open' and no interface"
+        yield error("check.state", node.where("state"), message, hint)
 
 
-def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the start order of nodes."""
-    for node in system.manifest.nodes:
-        for after in _once(node.after):
-            if after.node not in system.nodes:
-                message = f"cannot wait for node {after.node!r}: there is no such node"
-                hint = did_you_mean(after.node, system.nodes)
-                yield error("check.after-unknown", after.at, message, hint)
-            elif after.node == node.key:
-                message = f"cannot make {node.key!r} wait for itself"
-                yield error("check.after-self", after.at, message, "remove it")
-            else:
-                yield from _unmanaged(node, after, system.nodes[after.node])
-                yield from _kept_lower(after, system.nodes[after.node])
-    yield from cycles(system)
+def check_container(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield a finding about a component whose container cannot load it."""
+    name, other = node.run.container, system.nodes.get(node.run.container)
+    problem, hint = "", ""
+    if not name:
+        return
+    if name.startswith("/"):
+        problem = full_name_problem(name)
+    elif other is None:
+        problem = "there is no such node"
+        hint = did_you_mean(name, system.nodes) or "others' containers have a full name, '/NAME'"
+    elif other.machine != node.machine:
+        problem = f"it is for machine {node.machine!r}, {name!r} runs on {other.machine!r}"
+        hint = "put both on one machine"
+    if problem:
+        message = f"cannot load {node.key!r} into {name!r}: {problem}"
+        yield error("check.container", node.where("run.container"), message, hint)
+
+
+def check_order(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about what a node waits for."""
+    for after in _once(node.after):
+        other = system.nodes.get(after.node)
+        if other is None:
+            message = f"cannot wait for node {after.node!r}: there is no such node"
+            hint = did_you_mean(after.node, system.nodes)
+            yield error("check.after-unknown", after.at, message, hint)
+        elif other is node:
+            message = f"cannot make {node.key!r} wait for itself"
+            yield error("check.after-self", after.at, message, "remove it")
+        elif isinstance(after.condition, Condition):
+            yield from _never_holds(node, other, after.condition, after.at)
 
 
 def _once(afters: Iterable[After]) -> list[After]:
@@ -333,28 +297,29 @@ def _once(afters: Iterable[After]) -> list[After]:
     return [*{each.node: each for each in reversed([*afters])}.values()][::-1]
 
 
-def _unmanaged(node: Node, after: After, other: Node) -> Iterator[Diagnostic]:
-    """Judge conditions of nodes that have nothing but a start (see `Condition`)."""
-    key, condition = after.node, after.condition
-    if not isinstance(condition, Condition):
-        return
+def _never_holds(
+    node: Node, other: Node, condition: Condition, at: Position
+) -> Iterator[Diagnostic]:
+    """Judge conditions of nodes that have nothing but a start, or are kept in a lower state."""
+    key, beyond = other.key, condition in (Condition.ACTIVE, Condition.HEALTHY)
     if condition is Condition.HEALTHY and other.health is None:
         message = f"cannot wait until {key!r} is healthy: nothing says how that is known"
-        yield error(
-            "check.health", after.at, message, f"write 'health: {{check: true}}' at {key!r}"
-        )
-    elif not node.managed and condition in (Condition.ACTIVE, Condition.HEALTHY):
+        yield error("check.health", at, message, f"write 'health: {{check: true}}' at {key!r}")
+    elif not node.managed and beyond:
         message = (
-            f"cannot hold the start of {node.key!r} until {key!r} is {condition.value}: "
-            f"{node.key!r} is not "
-            f"managed, and nothing is activated before every node runs"
+            f"cannot hold the start of {node.key!r} until {key!r} is {condition}: {node.key!r} is "
+            "not managed, and nothing is activated before every node runs"
         )
-        yield error("check.after-unmanaged", after.at, message, f"write '{key}: connected'")
+        yield error("check.after-unmanaged", at, message, f"write '{key}: connected'")
     elif not other.managed and condition not in (Condition.STARTED, Condition.HEALTHY):
-        message = (
-            f"cannot wait until {key!r} is {condition.value}: it is not managed and only starts"
-        )
-        yield warning("check.after-unmanaged", after.at, message, f"write '{key}: started'")
+        message = f"cannot wait until {key!r} is {condition}: it is not managed and only starts"
+        yield warning("check.after-unmanaged", at, message, f"write '{key}: started'")
+    order, furthest = list(Condition), _FURTHEST[other.state]
+    if other.managed and order.index(condition) > order.index(furthest):
+        kept = other.state.value
+        message = f"cannot wait until {key!r} is {condition}: it is kept {kept}"
+        hint = f"write '{key}: {furthest}', or remove its 'state: {kept}'"
+        yield error("check.after-state", at, message, hint)
 
 
 _FURTHEST = {
@@ -365,20 +330,7 @@ _FURTHEST = {
 """How far the supervisor brings a node that is kept in a state."""
 
 
-def _kept_lower(after: After, other: Node) -> Iterator[Diagnostic]:
-    """Judge conditions that the supervisor keeps from ever holding."""
-    if not other.managed or not isinstance(after.condition, Condition):
-        return
-    order = list(Condition)
-    furthest = _FURTHEST[other.state]
-    if order.index(after.condition) > order.index(furthest):
-        key, kept = after.node, other.state.value
-        message = f"cannot wait until {key!r} is {after.condition}: it is kept {kept}"
-        hint = f"write '{key}: {furthest.value}', or remove its 'state: {kept}'"
-        yield error("check.after-state", after.at, message, hint)
-
-
-def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Report each circle once, at the edge that closes it; iterative, so depth has no limit."""
     edges = {
         key: [each for each in _once(node.after) if each.node in system.nodes and each.node != key]
@@ -402,20 +354,19 @@ def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 path[after.node] = iter(edges[after.node])
 
 
-def check_readiness(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about topics, services and parameters that others are waited for to have."""
-    for node in system.manifest.nodes:
-        for after in node.after:
-            other, wanted = system.nodes.get(after.node), after.condition
-            if other in (None, node) or not isinstance(wanted, Readiness):
-                continue
-            if wanted.by is ReadyBy.PARAMETER:
-                yield from _ready_parameter(after, wanted, other, system)
-            elif problem := name_problem(wanted.name):
-                message = f"cannot wait until {after.node!r} {wanted}: {problem}"
-                yield error("check.name", after.at, message)
-            else:
-                yield from _ready_endpoint(after, wanted, other, system)
+def check_readiness(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about topics, services and parameters that a node waits for others to have."""
+    for after in node.after:
+        other, wanted = system.nodes.get(after.node), after.condition
+        if other in (None, node) or not isinstance(wanted, Readiness):
+            continue
+        if wanted.by is ReadyBy.PARAMETER:
+            yield from _ready_parameter(after, wanted, other, system)
+        elif problem := name_problem(wanted.name):
+            message = f"cannot wait until {after.node!r} {wanted}: {problem}"
+            yield error("check.name", after.at, message)
+        else:
+            yield from _ready_endpoint(after, wanted, other, system)
 
 
 def _ready_endpoint(
@@ -425,7 +376,11 @@ def _ready_endpoint(
     names = [(kind, topic_of(other, wanted.name, kind)) for kind in wanted.by.kinds]
     if any(each.node.key == other.key for one in names for each in system.named(*one)):
         return
-    if not _of_every_node(other).isdisjoint(name for _, name in names):
+    of_every_node = {"/rosout", "/parameter_events"}
+    of_every_node |= {
+        f"{other.full_name}/{each}" for each in (*NODE_SERVICES, *OUR_SERVICES, "transition_event")
+    }
+    if not of_every_node.isdisjoint(name for _, name in names):
         hint = f"write '{after.node}: started'"
         yield error("check.after-undeclared", after.at, f"{message}: every node has it", hint)
         return
@@ -437,12 +392,6 @@ def _ready_endpoint(
         yield error("check.after-undeclared", after.at, why, hint)
     elif declared:
         yield note("check.after-undeclared", after.at, f"{why}, and may have others", hint)
-
-
-def _of_every_node(node: Node) -> frozenset[str]:
-    """Return what a node has as soon as it is there, which is not looked at in the graph."""
-    own = (*NODE_SERVICES, *OUR_SERVICES, "transition_event")
-    return frozenset({"/rosout", "/parameter_events", *(f"{node.full_name}/{x}" for x in own)})
 
 
 def _ready_parameter(
@@ -470,14 +419,13 @@ def _ready_parameter(
         yield error("check.after-value", after.at, why, "leave that value out")
 
 
-CHECKS = (
+CHECKS = (check_cycles, check_processes, check_on_violation, check_modes)
+OF_A_NODE = (
     check_order,
-    check_machines,
-    check_processes,
-    check_programs,
+    check_machine,
+    check_program,
+    check_container,
     check_supervision,
     check_health,
-    check_on_violation,
-    check_modes,
     check_readiness,
 )

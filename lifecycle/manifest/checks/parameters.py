@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,77 +24,52 @@ from lifecycle.manifest.parameter_files import (
 from lifecycle.manifest.parameter_values import is_implicit, misfit, suggestion
 
 
-def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the parameters of every node."""
-    names: dict[str, set[str]] = {}
-    for node in system.manifest.nodes:
-        names.setdefault(node.process_name, set()).add(node.name)
-    for node in system.manifest.nodes:
-        yield from _given(node)
-        yield from _no_effect(node)
-        yield from _for_no_node(node, names[node.process_name])
-        yield from _empty_arrays(node, system)
-
-
-def _given(node: Node) -> Iterator[Diagnostic]:
+def check_parameters(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about the parameters of a node, on its command line too."""
     declared = {each.name: each for each in node.interface.parameters}
-    for name, value in node.parameters:
-        at = node.where(f"parameters.{name}")
-        declaration = declared.get(name)
-        if declaration is not None:
-            yield from _judge(value, declaration.type, repr(name), at)
-        elif declared and not is_implicit(name) and f"parameters.{name}" not in node.shared:
+    given = [
+        (name, value, repr(name), node.where(f"parameters.{name}"))
+        for name, value in node.parameters
+    ]
+    for name, _, _, at in given:
+        is_known = not declared or name in declared or is_implicit(name)
+        if not is_known and f"parameters.{name}" not in node.shared:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
             yield error("check.parameter-undeclared", at, message, hint)
     at = node.where("run.command")
+    process = [each.name for each in system.processes[node.process_name]]
     for each in command_line_parameters(node):
-        declaration = declared.get(each.name)
-        read = given_value(each.text)
-        if declaration is None or read is None or each.node not in ("", node.name):
-            continue
-        what = f"{each.name!r} of {node.key!r} by '-p'"
-        yield from _judge(read, declaration.type, what, at)
+        value = given_value(each.text)
+        if each.node in ("", node.name):
+            if value is not None:
+                what = f"{each.name!r} of {node.key!r} by '-p'"
+                given.append((each.name, value, what, at))
+        elif each.node not in process:
+            message = (
+                f"cannot tell what takes '-p {each.node}:{each.name}': no node {each.node!r} is "
+                f"declared in the process of {node.key!r}"
+            )
+            hint = did_you_mean(each.node, process)
+            hint = hint or f"declared there: {', '.join(map(repr, sorted(process)))}"
+            yield warning("check.parameter-for-no-node", at, message, hint)
+    for name, value, what, at in given:
+        if name in declared:
+            yield from _judge(value, declared[name].type, what, at)
+    if declared:
+        return  # an array that none declares is reported as such
+    of_files = system.files.given(node)
+    for name, value, at in (*((name, value, at) for name, value, _, at in given), *of_files):
+        if value == ():
+            message = f"cannot tell the type of {name!r} of {node.key!r}: [] has none in ROS"
+            hint = f"declare it: 'interface: {{parameters: {{{name}: {{type: string_array}}}}}}'"
+            yield warning("check.parameter-empty-array", at, message, hint)
 
 
 def _judge(value: ParameterValue, declared: str, what: str, at: Position) -> Iterator[Diagnostic]:
     if problem := misfit(value, declared):
         message = f"cannot set parameter {what} to {problem}"
         yield error("check.parameter-type", at, message, suggestion(value, declared))
-
-
-def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
-    """Warn of values on a command line for a node that its process is not declared to have."""
-    at = node.where("run.command")
-    for each in command_line_parameters(node):
-        if each.node and each.node not in names:
-            message = (
-                f"cannot tell what takes '-p {each.node}:{each.name}': no node {each.node!r} is "
-                f"declared in the process of {node.key!r}"
-            )
-            listed = ", ".join(map(repr, sorted(names)))
-            hint = did_you_mean(each.node, names) or f"declared there: {listed}"
-            yield warning("check.parameter-for-no-node", at, message, hint)
-
-
-def _empty_arrays(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Warn of empty arrays whose type nothing declares: rcl reads none from `[]`."""
-    if node.interface.parameters:
-        return  # one that those do not declare is reported as such
-    given: list[tuple[str, ParameterValue | None, Position]] = [
-        (name, value, node.where(f"parameters.{name}")) for name, value in node.parameters
-    ]
-    given += [
-        (each.name, given_value(each.text), node.where("run.command"))
-        for each in command_line_parameters(node)
-        if each.name and each.node in ("", node.name)
-    ]
-    given += system.files.given(node)
-    for name, value, at in given:
-        if value == ():
-            message = f"cannot tell the type of {name!r} of {node.key!r}: [] has none in ROS"
-            hint = f"declare it: 'interface: {{parameters: {{{name}: {{type: string_array}}}}}}'"
-            yield warning("check.parameter-empty-array", at, message, hint)
 
 
 def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -110,17 +85,13 @@ def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
             elif why := _never_set(node, each):
                 yield error("check.mode", each.at, f"{what}{why[0]}", why[1])
             elif not _is_given(node, each.name, system):
-                others = [
-                    other.name
-                    for other in modes
-                    if all(
-                        (one.node, one.name) != (each.node, each.name) for one in other.parameters
-                    )
-                ]
-                if others:
-                    why_not = f"what it is in mode {others[0]!r} is not known"
-                    hint = f"give it there, or in 'nodes.{each.node}.parameters'"
-                    yield error("check.mode", each.at, f"{what}: {why_not}", hint)
+                of_mode = ({(one.node, one.name) for one in other.parameters} for other in modes)
+                for other, said in zip(modes, of_mode, strict=True):
+                    if (each.node, each.name) not in said:
+                        why_not = f"what it is in mode {other.name!r} is not known"
+                        hint = f"give it there, or in 'nodes.{each.node}.parameters'"
+                        yield error("check.mode", each.at, f"{what}: {why_not}", hint)
+                        break
 
 
 def _never_set(node: Node, given: ModeParameter) -> tuple[str, str] | None:
@@ -150,15 +121,14 @@ def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
     return any(name == found for found, _, _ in system.files.given(node))
 
 
-def _no_effect(node: Node) -> Iterator[Diagnostic]:
-    """Warn of values that an attached node is judged by but never given."""
+def check_unused(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Say of values that an attached node is judged by that it is never given them."""
     if node.run.kind is not RunKind.ATTACH or node.run.component:
         return
     own = [f"parameters.{name}" for name, _ in node.parameters]
     places = [(place, "parameters") for place in own if place not in node.shared]
-    places += [
-        (f"parameter_files.{i}", "parameter files") for i in range(len(node.parameter_files))
-    ]
+    if node.parameter_files:
+        places.append(("parameter_files.0", "parameter files"))
     for place, what in places[:1]:
         message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
         hint = "give them where it is started"
@@ -220,54 +190,38 @@ def given_value(text: str) -> ParameterValue | None:
 
 def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about every parameter file that a node names."""
-    readers: dict[str, list[Node]] = {}
+    readers: dict[str, list[tuple[Node, Position]]] = {}
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
-            if path not in readers:
-                at = node.where(f"parameter_files.{index}")
-                yield from _flaws(path, system.files.read(path), at)
-            readers.setdefault(path, []).append(node)
-    for node in system.manifest.nodes:
-        yield from _unmatched_file_of_command(node, system)
-    for path, nodes in readers.items():
+            readers.setdefault(path, []).append((node, node.where(f"parameter_files.{index}")))
+    for path, named in readers.items():
         file = system.files.read(path)
-        for node in () if file.flaws else nodes:
-            yield from _unmatched_node(path, file, node)
+        if not os.path.lexists(path):
+            message = f"cannot find the parameter file {file.shown!r}"
+            yield error("check.parameter-file", named[0][1], message, nearest_file(Path(path)))
+            continue
+        yield from file.flaws
+        for node, at in () if file.flaws else named:
+            if not any(section.matches(node.full_name) for section in file.sections):
+                listed = ", ".join(repr(each.pattern) for each in file.sections) or "no node"
+                message = (
+                    f"cannot find node {node.full_name!r} in {file.shown!r}: it is for {listed}"
+                )
+                hint = f"name the section {node.full_name}, or /** for every node"
+                yield warning("check.parameter-file-unmatched", at, message, hint)
             yield from _values(file, node)
         yield from _unmatched_sections(file, system)
-        yield from _unknown_to_all(file, nodes)
+        yield from _unknown_to_all(file, [node for node, _ in named])
 
 
-def _flaws(path: str, file: ParameterFile, at: Position) -> Iterator[Diagnostic]:
-    if os.path.lexists(path):
-        yield from file.flaws
-        return
-    message = f"cannot find the parameter file {file.shown!r}"
-    yield error("check.parameter-file", at, message, nearest_file(Path(path)))
-
-
-def _unmatched_node(path: str, file: ParameterFile, node: Node) -> Iterator[Diagnostic]:
-    name = node.full_name
-    if any(section.matches(name) for section in file.sections):
-        return
-    at = node.where(f"parameter_files.{node.parameter_files.index(path)}")
-    patterns = [section.pattern for section in file.sections]
-    listed = ", ".join(repr(each) for each in patterns) or "no node"
-    message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
-    hint = f"name the section {name}, or /** for every node"
-    yield warning("check.parameter-file-unmatched", at, message, hint)
-
-
-def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_files_of_command(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
     paths = [each.file for each in command_line_parameters(node) if each.file]
     if not paths:
         return
-    process = node.process_name
     every = [each.full_name for each in system.manifest.nodes]
-    names = [e.full_name for e in system.manifest.nodes if process == e.process_name]
+    names = [each.full_name for each in system.processes[node.process_name]]
     for file in map(system.files.read, paths):
-        at = node.where("run.command")
         mine = [each for each in file.sections if any(map(each.matches, names))]
         # One file for many processes has sections for the nodes of others.
         for section in file.sections:
@@ -277,6 +231,7 @@ def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[D
                     f"of the process of {node.key!r} has that name"
                 )
                 hint = did_you_mean(section.pattern, names)
+                at = node.where("run.command")
                 yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
@@ -325,4 +280,5 @@ def _unknown_to_all(file: ParameterFile, readers: list[Node]) -> Iterator[Diagno
                 yield warning("check.parameter-undeclared", at, message, did_you_mean(name, known))
 
 
-CHECKS = (check_parameters, check_parameter_files, check_mode_parameters)
+CHECKS = (check_parameter_files, check_mode_parameters)
+OF_A_NODE = (check_parameters, check_unused, check_files_of_command)

@@ -9,7 +9,7 @@ event), so that what connects to them is not reported as unconnected. Pure.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -65,6 +65,11 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
         """Where the endpoint is declared."""
         return self.endpoint.at
 
+    @property
+    def unmapped(self) -> str:
+        """The name before remapping, fully qualified."""
+        return expand(self.endpoint.name, self.node.name, self.node.namespace)
+
     def __str__(self) -> str:
         noun = self.endpoint.kind.noun
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
@@ -89,7 +94,8 @@ class DeclaredSystem:
         self.endpoints: list[Resolved] = []
         self.unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
         for node in manifest.nodes:
-            as_read = replace(node, remap=usable_rules(node))
+            rules = (pair for pair, rule in read_rules(node) if isinstance(rule, RemapRule))
+            as_read = replace(node, remap=tuple(rules))
             for endpoint in node.interface.endpoints:
                 try:
                     name = name_in_graph(as_read, endpoint.name, endpoint.kind)
@@ -119,6 +125,14 @@ class DeclaredSystem:
         return {node.key: node for node in self.manifest.nodes}
 
     @functools.cached_property
+    def processes(self) -> dict[str, list[Node]]:
+        """Nodes by the name of their process."""
+        grouped: dict[str, list[Node]] = {}
+        for node in self.manifest.nodes:
+            grouped.setdefault(node.process_name, []).append(node)
+        return grouped
+
+    @functools.cached_property
     def hosts(self) -> dict[str, list[Machine]]:
         """The machines that nodes run on, by address; those without one are this host."""
         used = {node.machine for node in self.manifest.nodes}
@@ -136,6 +150,14 @@ class DeclaredSystem:
             grouped.setdefault((each.endpoint.kind, each.name), []).append(each)
         return {key: tuple(group) for key, group in grouped.items()}
 
+    @functools.cached_property
+    def by_node(self) -> dict[str, list[Resolved]]:
+        """Endpoints by the key of their node."""
+        grouped: dict[str, list[Resolved]] = {}
+        for each in self.endpoints:
+            grouped.setdefault(each.node.key, []).append(each)
+        return grouped
+
     def named(self, kind: EndpointKind, name: str) -> tuple[Resolved, ...]:
         """Return the endpoints of one kind with this fully qualified name."""
         return self.by_name.get((kind, name), ())
@@ -152,17 +174,15 @@ class DeclaredSystem:
         )
 
 
-def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
-    """Return the node's remap rules that rcl reads; `check_remaps` reports the others."""
-    return tuple(rule for rule in node.remap if not isinstance(read_rule(*rule), LifecycleError))
-
-
-def read_rule(match: str, replacement: str) -> RemapRule | LifecycleError:
-    """Return a remap rule, or why rcl refuses it."""
-    try:
-        return parse_rule(match, replacement)
-    except LifecycleError as problem:
-        return problem
+def read_rules(node: Node) -> list[tuple[tuple[str, str], RemapRule | LifecycleError]]:
+    """Return each remap rule of a node, as written and as read, or why rcl refuses it."""
+    found: list[tuple[tuple[str, str], RemapRule | LifecycleError]] = []
+    for pair in node.remap:
+        try:
+            found.append((pair, parse_rule(*pair)))
+        except LifecycleError as problem:  # noqa: PERF203 - each is reported
+            found.append((pair, problem))
+    return found
 
 
 _NOT_BY_DEFAULT = ("get_logger_levels", "set_logger_levels")
@@ -185,7 +205,14 @@ _OF_THE_GRAPH = (
 def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]]:
     """Return kind and fully qualified name of every endpoint that exists undeclared."""
     names = set(_OF_THE_GRAPH)
-    names.update(_of_supervisors(system.manifest))
+    manifest, access = system.manifest, system.manifest.policy.access
+    if access is not RosInterfaceAccess.OFF:
+        names.add((EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC))
+        offered = supervisor_services(access, (each.name for each in manifest.modes))
+        for machine in ("", *(each.name for each in manifest.machines)):
+            prefix = supervisor_prefix(manifest.system, machine)
+            names.add((EndpointKind.PUBLISHER, supervisor_status_topic(prefix)))
+            names.update((EndpointKind.SERVICE_SERVER, f"{prefix}/{name}") for name in offered)
     for node in system.manifest.nodes:
         left_out = {*_NOT_BY_DEFAULT, *(() if node.managed else MANAGED_SERVICES)}
         services = {*NODE_SERVICES, *OUR_SERVICES} - left_out
@@ -195,33 +222,8 @@ def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]
     return frozenset(names)
 
 
-def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
-    """Yield what the supervisors of a system offer by its policy."""
-    access = manifest.policy.access
-    if access is RosInterfaceAccess.OFF:
-        return
-    yield EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC
-    for machine in ("", *(each.name for each in manifest.machines)):
-        prefix = supervisor_prefix(manifest.system, machine)
-        yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
-        for name in supervisor_services(access, (each.name for each in manifest.modes)):
-            yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
-
-
-_ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
-
-
-def check_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the names of nodes and endpoints."""
-    for node in system.manifest.nodes:
-        yield from _illegal_node(node)
-    yield from _illegal_endpoints(system)
-    yield from _duplicate_nodes(system)
-    for group in system.by_name.values():
-        yield from _duplicate_endpoints(group)
-
-
-def _illegal_node(node: Node) -> Iterator[Diagnostic]:
+def check_node_name(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about name and namespace of a node."""
     if problem := node_name_problem(node.name):
         message = f"cannot use {node.name!r} as the name of a node: {problem}"
         yield error("check.name", node.where("name"), message)
@@ -230,17 +232,20 @@ def _illegal_node(node: Node) -> Iterator[Diagnostic]:
         yield error("check.name", node.where("namespace"), message)
 
 
-def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_endpoint_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about names of endpoints that rcl refuses."""
     for node, endpoint, unresolved in system.unresolved:
-        noun = endpoint.kind.noun
         if problem := name_problem(endpoint.name):
-            message = f"cannot use {endpoint.name!r} as the name of a {noun}: {problem}"
+            message = (
+                f"cannot use {endpoint.name!r} as the name of a {endpoint.kind.noun}: {problem}"
+            )
             yield error("check.name", endpoint.at, message)
         elif not node_name_problem(node.name) and not namespace_problem(node.namespace):
             yield error("check.name", endpoint.at, unresolved.message, unresolved.hint)
 
 
-def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about two nodes of one name."""
     first: dict[str, Node] = {}
     for node in system.manifest.nodes:
         other = first.setdefault(node.full_name, node)
@@ -253,85 +258,54 @@ def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield error("check.duplicate-node", node.at, message, hint)
 
 
-def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
+def check_duplicate_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Judge endpoints of one kind and one name: twice in a node, or answered by several."""
-    first: dict[str, Resolved] = {}
-    for each in group:
-        other = first.setdefault(each.node.key, each)
-        noun = each.endpoint.kind.noun
-        if other is not each and not _remapped(each) and not _remapped(other):
+    for (kind, name), group in system.by_name.items():
+        first: dict[str, Resolved] = {}
+        for each in group:
+            other = first.setdefault(each.node.key, each)
+            # A rule that gave one of them its name is reported by `check_remaps`.
+            if other is not each and each.unmapped == other.unmapped == name:
+                message = (
+                    f"cannot have two {kind.noun}s {name!r} in one node: "
+                    f"{other.endpoint.name!r} is the same ({other.at.spelled})"
+                )
+                yield error("check.duplicate-endpoint", each.at, message, "remove one")
+        one, *others = first.values()
+        for each in others if kind.value.endswith("_servers") else ():
             message = (
-                f"cannot have two {noun}s {each.name!r} in one node: "
-                f"{other.endpoint.name!r} is the same ({other.at.spelled})"
-            )
-            yield error("check.duplicate-endpoint", each.at, message, "remove one")
-    servers = list(first.values())
-    if len(servers) > 1 and servers[0].endpoint.kind in _ANSWERING:
-        for each in servers[1:]:
-            message = (
-                f"cannot tell which of {len(servers)} servers answers {each.name!r}: "
-                f"{servers[0]} offers it as well"
+                f"cannot tell which of {len(first)} servers answers {name!r}: {one} offers it as "
+                "well"
             )
             hint = "move one of them with 'namespace:' or 'remap:'"
             yield note("check.several-servers", each.at, message, hint)
 
 
-def _remapped(each: Resolved) -> bool:
-    """Whether a rule gave it its name; then `check_remaps` reports the rule."""
-    return expand(each.endpoint.name, each.node.name, each.node.namespace) != each.name
-
-
-def check_remaps(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about remap rules."""
-    resolved: dict[str, list[Resolved]] = {}
-    for each in system.endpoints:
-        resolved.setdefault(each.node.key, []).append(each)
-    for node in system.manifest.nodes:
-        rules: list[tuple[str, RemapRule]] = []
-        for match, replacement in node.remap:
-            rule = read_rule(match, replacement)
-            if isinstance(rule, LifecycleError):
-                yield error("check.remap-rule", _place(node, match), rule.message, rule.hint)
-            else:
-                rules.append((match, rule))
-        shared = {node.where(each) for each in node.shared}
-        # A rule for many nodes is one for those that have the name.
-        yield from (
-            finding
-            for finding in _unused(node, rules)
-            if finding.severity is Severity.ERROR or finding.at not in shared
-        )
-        yield from _collisions(node, resolved.get(node.key, []))
-
-
-def _place(node: Node, match: str) -> Position:
-    return node.where(f"remap.{match}")
-
-
-def _unused(node: Node, rules: list[tuple[str, RemapRule]]) -> Iterator[Diagnostic]:
+def check_remaps(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about the remap rules of a node."""
     names = _graph_names(node)
-    used = {id(_first(node, rules, name, kind)) for name, kind in names if name}
-    for match, rule in rules:
-        at = _place(node, match)
-        if rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
+    fitting: dict[tuple[str, RemapKind], str] = {}  # the match that renames what has this name
+    for (match, _), rule in read_rules(node):
+        at = node.where(f"remap.{match}")
+        if isinstance(rule, LifecycleError):
+            yield error("check.remap-rule", at, rule.message, rule.hint)
+        elif rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
             key = "name" if rule.kind is RemapKind.NODE_NAME else "namespace"
             message = f"cannot remap {match!r} here: the manifest says who the node is"
             yield error("check.remap-identity", at, message, f"write '{key}: {rule.replacement}'")
-        elif rule.node not in ("", node.name):
-            message = (
-                f"cannot apply the rule {match!r}: it is for node {rule.node!r}, "
-                f"this one is {node.name!r}"
-            )
-            yield warning("check.remap-unused", at, message, "remove the prefix, or the rule")
-        elif id(rule) not in used:
-            yield from _never_matches(node, match, rule, names)
-
-
-def _first(
-    node: Node, rules: list[tuple[str, RemapRule]], name: str, kind: RemapKind
-) -> RemapRule | None:
-    fitting = (rule for _, rule in rules if rule.applies_to(kind, node.name))
-    return next((rule for rule in fitting if _expanded(node, rule.match) == name), None)
+        else:
+            wanted, is_used = _expanded(node, rule.match), False
+            for name, kind in names:
+                if rule.applies_to(kind, node.name) and wanted and wanted == name:
+                    is_used |= fitting.setdefault((name, kind), match) == match
+            if wanted and not is_used:
+                found = _unused(node, match, rule, names)
+                # A rule for many nodes is one for those that have the name.
+                if found and (
+                    found.severity is Severity.ERROR or f"remap.{match}" not in node.shared
+                ):
+                    yield found
+    yield from _collisions(node, system.by_node.get(node.key, ()))
 
 
 def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
@@ -354,62 +328,61 @@ def _expanded(node: Node, name: str) -> str:
         return ""
 
 
-def _never_matches(
-    node: Node,
-    match: str,
-    rule: RemapRule,
-    names: list[tuple[str, RemapKind]],
-) -> Iterator[Diagnostic]:
-    at = _place(node, match)
-    wanted = _expanded(node, rule.match)
+def _unused(
+    node: Node, match: str, rule: RemapRule, names: list[tuple[str, RemapKind]]
+) -> Diagnostic | None:
+    """Return why a rule renames nothing; None where a node may have more than it declares."""
+    at, wanted = node.where(f"remap.{match}"), _expanded(node, rule.match)
+    if rule.node not in ("", node.name):
+        message = (
+            f"cannot apply the rule {match!r}: it is for node {rule.node!r}, "
+            f"this one is {node.name!r}"
+        )
+        return warning("check.remap-unused", at, message, "remove the prefix, or the rule")
     actions = [each.name for each in node.interface.endpoints if each.kind.is_action]
-    if not wanted:
-        return
     if any(_expanded(node, name) == wanted for name in actions):
-        yield error(
+        return error(
             "check.remap-action",
             at,
             f"cannot remap the action {wanted!r}: rcl remaps its hidden topics and services only",
             f"remap {match}/_action/send_goal, …/cancel_goal, …/get_result, …/feedback and "
             "…/status, or declare the action by its final name",
         )
-    elif any(name == wanted and kind & rule.kind for name, kind in names):
+    known = [name for name, kind in names if kind & rule.kind]
+    if wanted in known:
         message = f"cannot apply the rule {match!r}: an earlier rule for {wanted!r} always wins"
-        yield warning("check.remap-shadowed", at, message, "remove one of the two")
-    elif node.endpoints is EndpointPolicy.DECLARED:
-        known = [name for name, kind in names if kind & rule.kind]
-        message = f"cannot apply the rule {match!r}: no endpoint of the node is named {wanted!r}"
-        yield warning("check.remap-unused", at, message, did_you_mean(wanted, known))
+        return warning("check.remap-shadowed", at, message, "remove one of the two")
+    if node.endpoints is not EndpointPolicy.DECLARED:
+        return None
+    message = f"cannot apply the rule {match!r}: no endpoint of the node is named {wanted!r}"
+    return warning("check.remap-unused", at, message, did_you_mean(wanted, known))
 
 
-def _collisions(node: Node, resolved: list[Resolved]) -> Iterator[Diagnostic]:
+def _collisions(node: Node, resolved: Iterable[Resolved]) -> Iterator[Diagnostic]:
     """Refuse a rule that gives an endpoint the name of another one of its kind and node."""
     first: dict[tuple[EndpointKind, str], Resolved] = {}
     for each in resolved:
         other = first.setdefault((each.endpoint.kind, each.name), each)
-        before = [expand(one.endpoint.name, node.name, node.namespace) for one in (other, each)]
-        if other is each or before == [each.name, each.name]:
+        if other is each or each.unmapped == other.unmapped == each.name:
             continue
-        moved, stays = (each, other) if before[1] != each.name else (other, each)
+        moved, stays = (each, other) if each.unmapped != each.name else (other, each)
         message = (
             f"cannot remap {each.endpoint.kind.noun} {moved.endpoint.name!r} onto {each.name!r}: "
             f"{stays.endpoint.name!r} of the same node has that name ({stays.at.spelled})"
         )
-        yield error("check.remap-collision", _rule_place(moved), message, "remap only one of them")
+        # The place of the rule that renamed it; the endpoint's if it is not plain.
+        at = next(
+            (
+                node.where(f"remap.{match}")
+                for (match, _), rule in read_rules(node)
+                if isinstance(rule, RemapRule)
+                and rule.match
+                and _expanded(node, rule.match) == moved.unmapped
+            ),
+            moved.at,
+        )
+        yield error("check.remap-collision", at, message, "remap only one of them")
 
 
-def _rule_place(moved: Resolved) -> Position:
-    """Return the place of the rule that renamed an endpoint; the endpoint's if it is not plain."""
-    node = moved.node
-    expanded = expand(moved.endpoint.name, node.name, node.namespace)
-    for match, replacement in usable_rules(node):
-        rule = parse_rule(match, replacement)
-        if rule.match and _expanded(node, rule.match) == expanded:
-            return _place(node, match)
-    return moved.at
-
-
-CHECKS = (
-    check_names,
-    check_remaps,
-)
+CHECKS = (check_endpoint_names, check_duplicate_nodes, check_duplicate_endpoints)
+OF_A_NODE = (check_node_name, check_remaps)

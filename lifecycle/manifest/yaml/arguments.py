@@ -124,7 +124,16 @@ class Substituted:
                 self._report("manifest.substitution", place, message)
                 continue
             self.arguments[name] = value
-            self._check_choice(name, value, place)
+            choices = self.document.find((*place, "choices"))
+            allowed = (
+                [each.text for each in choices.data]
+                if choices and isinstance(choices.data, tuple)
+                else []
+            )
+            if allowed and value not in allowed:
+                message = f"cannot set {name} to {quote(value)}; allowed: {', '.join(allowed)}"
+                hint = did_you_mean(value, allowed)
+                self._report("manifest.argument-choice", place, message, hint)
 
     def _default(self, name: str, place: Place) -> str | None:
         default = self.document.find((*place, "default"))
@@ -147,19 +156,6 @@ class Substituted:
         resolved = self.value(default, (*place, "default"))
         return None if (*place, "default") in self.broken else resolved.text
 
-    def _check_choice(self, name: str, value: str, place: Place) -> None:
-        choices = self.document.find((*place, "choices"))
-        if choices is None or not isinstance(choices.data, tuple) or not choices.data:
-            return
-        allowed = [each.text for each in choices.data]
-        if value not in allowed:
-            self._report(
-                "manifest.argument-choice",
-                place,
-                f"cannot set {name} to {quote(value)}; allowed: {', '.join(allowed)}",
-                did_you_mean(value, allowed),
-            )
-
     def _leave_open(self, place: Place, problem: LifecycleError) -> None:
         """Leave a value out that a program would write; what must be there is an error."""
         if "arguments" in place[:1] or place[-1] in CONDITIONS:
@@ -174,34 +170,29 @@ class Substituted:
         """Return a value with its conditions read, which may be `broken`; None if left out."""
         if not isinstance(value.data, Mapping):
             return value
-        written = [key for key in CONDITIONS if key in value.data]
         known: dict[str, Value] = {}
-        for key in written:
-            inside = (*place, key)
-            each = self.value(value.data[key], inside)
-            holds = None if isinstance(each.data, (tuple, Mapping)) else truth(each.text)
-            if inside in self.broken:
+        for key in CONDITIONS:
+            if key not in value.data:
+                continue
+            at, message = (*place, key), "cannot use if and unless together"
+            hint = "write if: $(and A $(not B))"
+            each = self.value(value.data[key], at)
+            if at in self.broken:
                 self.broken[-1] = place
                 return value
+            holds = None if isinstance(each.data, (tuple, Mapping)) else truth(each.text)
             if holds is None:
                 message = f"cannot use {key} {quote(each.plain())}; allowed: true, false, 1, 0"
                 hint = "write $(equals A B), $(not A), $(and A B) or $(or A B)"
-                self._break(inside, place, message, hint)
+            if holds is None or known:
+                self._report("manifest.condition", at, message, hint)
+                self.broken.append(place)
                 return value
             known[key] = replace(each, data=holds)
-        if len(written) > 1:
-            message = "cannot use if and unless together"
-            hint = "write if: $(and A $(not B))"
-            self._break((*place, "unless"), place, message, hint)
-            return value
-        if known and known[written[0]].data is not (written[0] == "if"):
+        if any(each.data is not (key == "if") for key, each in known.items()):
             self.left_out[place] = None
             return None
         return replace(value, data={**value.data, **known}) if known else value
-
-    def _break(self, at: Place, place: Place, message: str, hint: str) -> None:
-        self._report("manifest.condition", at, message, hint)
-        self.broken.append(place)
 
     def value(self, value: Value, place: Place = ()) -> Value:
         """Return `value` with every substitution inside it resolved, and no node that is left out.
@@ -268,8 +259,7 @@ class Substituted:
     def _spend(self, text: str) -> None:
         if not _encodable(text):
             raise LifecycleError(f"cannot use {quote(text)}: it is not UTF-8")
-        exhausted = self._room < 0
-        self._room -= len(text)
+        exhausted, self._room = self._room < 0, self._room - len(text)
         if self._room < 0:
             message = f"cannot substitute more than {MAX_TEXT} characters in one document"
             raise LifecycleError("" if exhausted else message)
@@ -297,7 +287,7 @@ class Substituted:
             return self._surroundings.package_share(words[0])
         if each.kind == "file":
             return self._surroundings.file(words[0])
-        return decide(each.kind, words, each.written)
+        return quote(decide(each.kind, words, each.written))
 
     def _variable(self, name: str, default: list[Text], place: Place) -> str:
         found = self._surroundings.environment.get(name)

@@ -88,42 +88,39 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
         reason = problem.strerror if isinstance(problem, OSError) else str(problem)
         raise _refuse(file, f"cannot open {quote(str(path), limit=200)}: {reason}") from problem
     status = os.fstat(descriptor)
-    mode = status.st_mode
-    if not stat.S_ISREG(mode):
+    kind = "" if stat.S_ISREG(status.st_mode) else "a special file"
+    for is_of_kind, name in _KINDS:
+        kind = name if is_of_kind(status.st_mode) else kind
+    for each in ("/proc", "/sys"):
+        # Every file there claims to be a regular one; reading /proc/kmsg waits, and takes away.
+        with contextlib.suppress(OSError):
+            if os.stat(each).st_dev == status.st_dev:  # noqa: PTH116 - of a text
+                kind = kind or "a file that the kernel makes up (/proc, /sys)"
+    if kind:
         os.close(descriptor)
-        raise _refuse(file, f"cannot read {_kind(mode)} as a manifest", "name a regular file")
-    if status.st_dev in _kernel_devices():
-        os.close(descriptor)
-        message = "cannot read a file that the kernel makes up (/proc, /sys) as a manifest"
-        raise _refuse(file, message, "name a regular file")
+        raise _refuse(file, f"cannot read {kind} as a manifest", "name a regular file")
     with os.fdopen(descriptor, "rb") as stream:
         try:
             data: bytes | None = stream.read(MAX_BYTES + 1)
         except OSError as problem:  # a network file system, a broken disk, much of /proc
             raise _refuse(file, f"cannot read this file: {problem.strerror}") from problem
         if data is None:  # O_NONBLOCK: /proc/kmsg and its like never end, they wait
-            raise _refuse(
-                file,
-                "cannot read a file that has no end and nothing to read",
-                "name a regular file",
-            )
+            message = "cannot read a file that has no end and nothing to read"
+            raise _refuse(file, message, "name a regular file")
         if len(data) > MAX_BYTES:
-            size = max(os.fstat(descriptor).st_size, len(data))
-            raise _refuse(
-                file,
-                f"cannot read a file of {size} bytes; at most {MAX_BYTES} are allowed",
-                "split it with 'include:'",
-            )
+            size = max(status.st_size, len(data))
+            message = f"cannot read a file of {size} bytes; at most {MAX_BYTES} are allowed"
+            raise _refuse(file, message, "split it with 'include:'")
     return data
 
 
-def _kernel_devices() -> set[int]:
-    """Where every file claims to be a regular one; reading /proc/kmsg waits, and takes away."""
-    found = set()
-    for each in ("/proc", "/sys"):
-        with contextlib.suppress(OSError):
-            found.add(os.stat(each).st_dev)  # noqa: PTH116 - of a text
-    return found
+_KINDS = (
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a character device"),
+    (stat.S_ISBLK, "a block device"),
+)
 
 
 def decode(data: bytes, *, file: str) -> str:
@@ -151,17 +148,6 @@ def _refuse(file: str, message: str, hint: str = "", before: str = "") -> Manife
     column = len(before) - (before.rfind("\n") + 1) + 1
     at = Position(file=file, line=line, column=column)
     return ManifestError([error("yaml.file", at, message, hint)])
-
-
-def _kind(mode: int) -> str:
-    kinds = (
-        (stat.S_ISDIR, "a directory"),
-        (stat.S_ISFIFO, "a FIFO"),
-        (stat.S_ISSOCK, "a socket"),
-        (stat.S_ISCHR, "a character device"),
-        (stat.S_ISBLK, "a block device"),
-    )
-    return next((name for test, name in kinds if test(mode)), "a special file")
 
 
 EMPTY = "cannot read an empty file"
@@ -224,28 +210,25 @@ class _Composer:
 
     def __init__(self, text: str, file: str) -> None:
         self._file = file
-        self._events = self._parse(text)
+        self._events = events(text, file=file)
         self._anchors: dict[str, Value | None] = {}  # None while still open
         self._found: list[Diagnostic] = []
         self._values = 0
         self._aliases = 0
 
-    def _parse(self, text: str) -> Iterator[yaml.Event]:
-        try:
-            yield from events(text, file=self._file)
-        except ManifestError as problem:
-            raise ManifestError([*self._found, *problem.diagnostics]) from problem
-
     def run(self) -> tuple[Document, tuple[Diagnostic, ...]]:
         root = None
-        for event in self._events:
-            if isinstance(event, yaml.DocumentStartEvent) and root is not None:
-                message = "cannot read more than one document in a file"
-                self._stop(_mark(event), (), message, "remove this '---'")
-            elif isinstance(event, yaml.NodeEvent):
-                root = self._node(event, ())
-        if root is None:
-            self._stop((1, 1), (), EMPTY, "start with 'manifest_version: 1'")
+        try:
+            for event in self._events:
+                if isinstance(event, yaml.DocumentStartEvent) and root is not None:
+                    message = "cannot read more than one document in a file"
+                    self._stop(_mark(event), (), message, "remove this '---'")
+                elif isinstance(event, yaml.NodeEvent):
+                    root = self._node(event, ())
+            if root is None:
+                self._stop((1, 1), (), EMPTY, _START)
+        except ManifestError as problem:
+            raise ManifestError([*self._found, *problem.diagnostics]) from problem
         return Document(file=self._file, root=root), tuple(self._found)
 
     def _node(self, event: yaml.Event, place: Place) -> Value:
@@ -260,24 +243,21 @@ class _Composer:
             self._refuse_tag(event.tag, mark, place)
             if len(place) >= MAX_DEPTH:
                 self._stop(mark, place, _TOO_DEEP)
-            self._begin(event, place)
-            is_mapping = isinstance(event, yaml.MappingStartEvent)
-            data = self._mapping(place) if is_mapping else self._sequence(place)
+            self._count(mark, place)
+            if event.anchor is not None:
+                self._anchors[event.anchor] = None
+            data: tuple[Value, ...] | dict[str, Value]
+            if isinstance(event, yaml.MappingStartEvent):
+                data = self._mapping(place)
+            else:
+                inside: list[Value] = []
+                while not isinstance(each := next(self._events), yaml.SequenceEndEvent):
+                    inside.append(self._node(each, (*place, len(inside))))
+                data = tuple(inside)
             value = Value(data=data, line=mark[0], column=mark[1])
         if event.anchor is not None:
             self._anchors[event.anchor] = value
         return value
-
-    def _begin(self, event: yaml.NodeEvent, place: Place) -> None:
-        self._count(_mark(event), place)
-        if event.anchor is not None:
-            self._anchors[event.anchor] = None
-
-    def _sequence(self, place: Place) -> tuple[Value, ...]:
-        inside: list[Value] = []
-        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            inside.append(self._node(event, (*place, len(inside))))
-        return tuple(inside)
 
     def _mapping(self, place: Place) -> dict[str, Value]:
         data: dict[str, Value] = {}
@@ -291,7 +271,7 @@ class _Composer:
     def _scalar(self, event: yaml.ScalarEvent, place: Place) -> Value:
         mark = _mark(event)
         self._refuse_tag(event.tag, mark, place)
-        self._begin(event, place)
+        self._count(mark, place)
         if _UNFIT.search(event.value):
             message = f"cannot use {quote(event.value)}: it holds a NUL or half a character"
             self._note("yaml.character", mark, place, message, "remove the escape")
@@ -377,9 +357,9 @@ class _Composer:
         self._found.append(error(rule, self._position(mark, place), message, hint))
 
     def _stop(self, mark: _Mark, place: Place, message: str, hint: str = "") -> NoReturn:
-        """Give up at once, with everything found so far."""
+        """Give up at once."""
         at = self._position(mark, place[:_SHOWN_DEPTH])
-        raise ManifestError([*self._found, error("yaml.limit", at, message, hint)])
+        raise ManifestError([error("yaml.limit", at, message, hint)])
 
 
 _TOO_DEEP = f"cannot read values nested deeper than {MAX_DEPTH} levels"

@@ -118,16 +118,33 @@ def _parse(text: str, at: int, end: str, depth: int) -> tuple[Text, int]:
 
 
 def _substitution(text: str, begin: int, depth: int) -> tuple[Substitution, int]:
+    """Read a kind and its words, in quotes or not, up to the closing parenthesis."""
     if depth > MAX_DEPTH:
         raise LifecycleError(f"cannot substitute more than {MAX_DEPTH} levels inside each other")
     match = _KIND.match(text, begin + 2)
     assert match is not None
-    kind = match[1]
-    if kind in _WORDS:
-        return _worded(text, begin, kind, match.end(), depth)
-    whole = text[begin : _closing(text, begin)]
-    hint = _ELSEWHERE.get(kind, ALLOWED)
-    raise LifecycleError(f"cannot substitute {quote(whole)}", hint=hint)
+    kind, at = match[1], match.end()
+    words: list[Text] = []
+    least, most = _WORDS.get(kind, (0, 0))
+    while True:
+        space = _SPACE.match(text, at)
+        assert space is not None
+        at = space.end()
+        mark = text[at : at + 1]
+        if kind in _WORDS and mark == ")" and least <= len(words) <= (most or len(words)):
+            written = text[begin : at + 1]
+            return Substitution(kind=kind, written=written, words=tuple(words)), at + 1
+        if kind not in _WORDS or mark in ("", "(", ")"):
+            whole = text[begin : _closing(text, begin)]
+            hint = _ELSEWHERE.get(kind, ALLOWED)
+            raise LifecycleError(f"cannot substitute {quote(whole)}", hint=hint)
+        is_quoted = mark in "'\""
+        word, at = _parse(text, at + is_quoted, mark if is_quoted else " \t\r\n()", depth)
+        if is_quoted and at >= len(text):
+            message = f"cannot find the closing {mark} in {quote(text[begin:])}"
+            raise LifecycleError(message)
+        at += is_quoted
+        words.append(word)
 
 
 def _closing(text: str, begin: int) -> int:
@@ -140,52 +157,23 @@ def _closing(text: str, begin: int) -> int:
     return len(text)
 
 
-def _worded(text: str, begin: int, kind: str, at: int, depth: int) -> tuple[Substitution, int]:
-    """Read words, in quotes or not, up to the closing parenthesis."""
-    words: list[Text] = []
-    least, most = _WORDS[kind]
-    while True:
-        space = _SPACE.match(text, at)
-        assert space is not None
-        at = space.end()
-        mark = text[at : at + 1]
-        if mark == ")" and least <= len(words) <= (most or len(words)):
-            written = text[begin : at + 1]
-            return Substitution(kind=kind, written=written, words=tuple(words)), at + 1
-        if mark in ("", "(", ")"):
-            whole = text[begin : _closing(text, begin)]
-            raise LifecycleError(f"cannot substitute {quote(whole)}", hint=ALLOWED)
-        is_quoted = mark in "'\""
-        word, at = _parse(text, at + is_quoted, mark if is_quoted else " \t\r\n()", depth)
-        if is_quoted:
-            if at >= len(text):
-                message = f"cannot find the closing {mark} in {quote(text[begin:])}"
-                raise LifecycleError(message)
-            at += 1
-        words.append(word)
-
-
 def truth(text: str) -> bool | None:
     """Return what a condition's text means, as launch reads it; None if it means neither."""
     return {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
 
 
-def decide(kind: str, words: list[str], written: str) -> str:
-    """Return `true` or `false` of a `$(not …)`, `$(equals …)` and the others."""
+def decide(kind: str, words: list[str], written: str) -> bool:
+    """Return what a `$(not …)`, `$(equals …)` and the others say."""
     if kind in ("equals", "not-equals"):
-        return _spelled((words[0] == words[1]) == (kind == "equals"))
+        return (words[0] == words[1]) == (kind == "equals")
     truths = [truth(each) for each in words]
-    for word, each in zip(words, truths, strict=True):
-        if each is None:
-            message = f"cannot use {quote(word)} in {quote(written)}; allowed: true, false, 1, 0"
-            raise LifecycleError(message)
+    if None in truths:
+        word = quote(words[truths.index(None)])
+        message = f"cannot use {word} in {quote(written)}; allowed: true, false, 1, 0"
+        raise LifecycleError(message)
     if kind == "not":
-        return _spelled(not truths[0])
-    return _spelled(all(truths) if kind == "and" else any(truths))
-
-
-def _spelled(value: object) -> str:
-    return "true" if value else "false"
+        return not truths[0]
+    return all(truths) if kind == "and" else any(truths)
 
 
 class NotRunError(LifecycleError):
