@@ -249,7 +249,7 @@ def is_measuring(run: Run) -> bool:
     if run.is_past(until_s):
         return False
     away = any(each.away_s is not None for each in run.processes.values())
-    if away or run.paused or run.passage or run.order or run.change or run.switch:
+    if away or run.paused or run.passage or run.order or run.switch:
         return True
     verdict, judged = run.judged.verdict, run.judged
     left_s = until_s - run.now_s

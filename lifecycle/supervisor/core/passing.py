@@ -22,7 +22,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import NOT_PROGRAMMED, TRANSITION_FAILED, About
 from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.verdict import Verdict
 
 CLOSED = "the verdict keeps the gate closed"
 
@@ -296,12 +296,9 @@ def settle_first_contact(run: Run) -> list[Event]:
     passage, judged = run.asked, run.judged
     if passage is None or not passage.at_gate or run.opening is not None or run.failures:
         return []
-    if judged.verdict is None or gate.allows(run):
-        return []
     is_late = passage.until_s - run.now_s <= UNCHANGED_S or passage.tries.total() >= TRIES
-    if is_late or advance.stage_of(run) is not Stage.CONNECTED:
-        return []
-    if not gate.lasts_until(run, judged.since_s + UNCHANGED_S):
+    lasts = gate.lasts_until(run, judged.since_s + UNCHANGED_S)
+    if judged.verdict is None or is_late or not lasts:
         return []
     name = undiscovered(judged.verdict, _restartable(run), passage.tries)
     node = None if name is None else run.node_named(name)
