@@ -36,6 +36,8 @@ SIGINT, SIGTERM, SIGKILL = 2, 15, 9
 OWN_S = 0.5
 """Our hosts keep the limits of transitions themselves and know more: they speak first."""
 
+_THEIRS = (Step.CONFIGURE, Step.CONNECT, Step.ACTIVATE, Step.DEACTIVATE)
+
 GLANCE_S = 1.0
 """More for a run whose time is over, and whose last verdict is not of now or not ok: others may be
 about to say that they end, too."""
@@ -289,12 +291,14 @@ def _goes_with_container(run: Run, node: Node) -> bool:
 
 def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
     appears = step is Step.START and only_appears(node) and not node.planned.holds
+    theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
     node.request = Request(
         number=run.requests,
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_of(node.planned, step),
+        own_s=OWN_S if theirs else 0.0,
     )
     if step is Step.ACTIVATE and run.passage is not None:
         run.passage.sent.add(node.key)
@@ -305,7 +309,7 @@ def _ask(run: Run, node: Node, step: Step) -> messages.Ask:
 def late_at_s(request: Request) -> float:
     """Return when a request is late: its process's time without a processor does not count."""
     waited_s = min(request.waited_s, 9 * request.limit_s)
-    return request.since_s + request.limit_s + OWN_S + waited_s
+    return request.since_s + request.limit_s + request.own_s + waited_s
 
 
 # Processes

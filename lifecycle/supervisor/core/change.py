@@ -202,11 +202,12 @@ def _take(run: Run, change: Change) -> None:
         run.revision = run.revisions
     stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
     run.first = plan
-    for key in change.down:
-        run.nodes.pop(key, None)
+    gone = {key: run.nodes.pop(key) for key in change.down & run.nodes.keys()}
     adopted = {each.key for each in plan.nodes if each.full_name in run.adopted}
     plan = attached_to(in_mode(plan, run.mode), adopted)
     install(run, _connected_as(plan, stays, before))
+    for key in gone.keys() & run.nodes.keys():  # who was kept inactive waits for a person still
+        run.nodes[key].withheld, run.nodes[key].refused = gone[key].withheld, gone[key].refused
     for key in change.touched & run.nodes.keys():
         process = run.processes.get(run.nodes[key].process)
         if process is not None and process.state is None:

@@ -240,7 +240,7 @@ def has_probation(run: Run) -> bool:
 def is_unsettled(run: Run) -> bool:
     """Return whether data cannot be measured now: it is paused, or some of it is on its way."""
     away = any(each.away_s is not None for each in run.processes.values())
-    return bool(away or run.paused or run.passage or run.order or run.change or run.switch)
+    return bool(away or run.paused or run.passage or run.order or run.switch)
 
 
 def is_measuring(run: Run) -> bool:

@@ -22,7 +22,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import NOT_PROGRAMMED, TRANSITION_FAILED, About
 from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.verdict import Verdict
 
 CLOSED = "the verdict keeps the gate closed"
 
@@ -84,7 +84,7 @@ def _come(run: Run) -> list[Event]:
         return []
     asked = run.asked
     waited = asked is not None and run.is_past(asked.since_s + gate.SAY_S)
-    nodes = [each for each in run.nodes.values() if advance.only_appears(each)]
+    nodes = [each for each in run.nodes.values() if each.process and advance.only_appears(each)]
     if not waited and any(not each.level and advance.wanted(run, each) for each in nodes):
         return []
     run.came, run.again = False, run.held_s is not None
@@ -144,7 +144,6 @@ def programmed(run: Run, given: Programmed) -> list[Event]:
         return []  # that passage was given up
     passage.programming = 0
     if given.error:
-        run.passage = None
         found = Failure(rule=NOT_PROGRAMMED.id, subject=run.plan.system, message=given.error)
         return failure.fail(run, found)
     return []
@@ -154,7 +153,7 @@ def _go_on(run: Run, passage: Passage) -> list[Event]:
     verdict = run.judged.verdict
     assert verdict is not None
     assert passage.begun_s is not None
-    nodes = [run.nodes[key] for key in passage.waiting if key in run.nodes]
+    nodes = [run.nodes[key] for key in passage.waiting]
     behind = [each for each in nodes if advance.wanted(run, each) is Level.ACTIVE]
     done = passage.is_programmed and all(each.level is Level.ACTIVE for each in behind)
     if gate.is_open(run) and passage.is_programmed:
@@ -187,8 +186,7 @@ def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
 
 
 def _passed(run: Run) -> list[Event]:
-    run.passage = None
-    run.again = False
+    run.passage, run.again = None, False
     for node in run.nodes.values():
         if node.level is Level.ACTIVE:
             node.guarded = 0
@@ -205,15 +203,12 @@ def reached(run: Run, what: str) -> Event:
     return SystemReached(reached=what, elapsed_s=run.now_s)
 
 
-def _withdraw(run: Run) -> list[Event]:
-    passage = run.passage
-    begun = [] if passage is None else [run.nodes[key] for key in passage.sent & run.nodes.keys()]
+def _withdraw(run: Run, passage: Passage) -> list[Event]:
+    begun = [run.nodes[key] for key in passage.sent]
     for node in begun:
         node.let_through = False
-    if passage is not None and passage.paused:
-        run.paused = True
-    run.passage = None
-    run.again = False
+    run.paused = run.paused or passage.paused
+    run.passage, run.again = None, False
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 
@@ -234,7 +229,7 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
             stopping = f"{stopping}, and {over}"
         return failure.end_refused(run, verdict, stopping)
     sent = tuple(passage.sent)
-    said = _withdraw(run)
+    said = _withdraw(run, passage)
     change = run.change
     if change is not None and not change.back:
         return [*said, *go_back(run, text, code)]
@@ -266,7 +261,7 @@ def _became_another(run: Run) -> list[Event]:
         return failure.end_refused(run, verdict, "what became active is not what was verified")
     run.passage = None
     events: list[Event] = []
-    for key in sorted(passage.sent & run.nodes.keys()):
+    for key in sorted(passage.sent):
         node = run.nodes[key]
         text = (
             f"cannot keep {node.name!r} active: what became active is not what was verified; "
@@ -296,12 +291,9 @@ def settle_first_contact(run: Run) -> list[Event]:
     passage, judged = run.asked, run.judged
     if passage is None or not passage.at_gate or run.opening is not None or run.failures:
         return []
-    if judged.verdict is None or gate.allows(run):
-        return []
     is_late = passage.until_s - run.now_s <= UNCHANGED_S or passage.tries.total() >= TRIES
-    if is_late or advance.stage_of(run) is not Stage.CONNECTED:
-        return []
-    if not gate.lasts_until(run, judged.since_s + UNCHANGED_S):
+    lasts = gate.lasts_until(run, judged.since_s + UNCHANGED_S)
+    if judged.verdict is None or is_late or not lasts:
         return []
     name = undiscovered(judged.verdict, _restartable(run), passage.tries)
     node = None if name is None else run.node_named(name)

@@ -126,7 +126,7 @@ class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
     Attributes:
-        limit_s: that the manifest sets.
+        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
         waited_s: of the time since, without CPU: it does not count.
         said: it was said that it takes long.
     """
@@ -135,6 +135,7 @@ class Request(msgspec.Struct, kw_only=True):
     step: Step
     since_s: float
     limit_s: float
+    own_s: float = 0.0
     waited_s: float = 0.0
     said: bool = False
 

@@ -537,6 +537,21 @@ def test_what_concerns_no_node_of_the_system_pauses_all_of_it() -> None:
     assert (play.levels, len(play.heard(ConsequenceTaken))) == ("4 4", 1)
 
 
+def test_who_a_consequence_keeps_inactive_stays_so_when_a_manifest_is_taken_back() -> None:
+    kept = replace(ARM, on_violation=(Reaction(rule="default", what=DEACTIVATE),))
+    play = Play(plan_of(CAMERA, VIEWER, kept))
+    play.see(("param.value-differs", "/arm"))
+    assert play.wait(0.5) == ["arm deactivate"]
+    play.see()
+    play.ways["viewer configure"] = "hang"
+    play.order(APPLY, plan=plan_of(CAMERA, LOUD, replace(kept, log_level="debug")))
+    play.finish("viewer configure", error="no display")
+    play.wait(1.0)
+    assert (play.answers[0][0], play.levels) == (6, "4 4 3")
+    play.order(RESUME)
+    assert play.levels == "4 4 4"
+
+
 def test_a_node_that_is_started_again_has_no_consequence_for_being_away() -> None:
     stop = Reaction(rule="default", what=Consequence.STOP)
     play = Play(replace(chain(), on_violation=(stop,)))

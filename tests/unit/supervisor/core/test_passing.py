@@ -106,7 +106,7 @@ def test_a_plain_node_declared_as_managed_is_named_after_2_s_with_the_key_that_m
     mends = "if it is a plain node, write 'managed: false' at nodes.driver"
     said = f"'/driver' is still {waits}, for up to 8 s more; {mends}"
     assert [each.message for each in play.heard(Notice)] == [said]
-    play.wait(8.5)
+    play.wait(8.0)
     late = f"cannot bring up '/driver': it was still {waits} after 10 s; {mends}"
     assert play.failures == [("/driver", late)]
 

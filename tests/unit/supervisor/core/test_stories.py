@@ -229,6 +229,13 @@ def test_a_death_ends_the_run_unless_it_is_to_keep_going() -> None:
     assert (play.code, play.reason) == (6, "done, but failed: /camera (run.process-died)")
 
 
+def test_a_death_before_the_system_was_up_ends_the_run_also_if_it_is_to_keep_going() -> None:
+    play = Play(CHAIN, ways={"viewer configure": "hang"}, keep_going=True)
+    play.die("camera")
+    play.wait(60.0)
+    assert (play.code, play.reason) == (6, "failed: /camera (run.process-died)")
+
+
 def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not() -> None:
     how = msgspec.structs.replace(AGAIN, watchdog_sec=2.0)
     play = Play(chain(how))
