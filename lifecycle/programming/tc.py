@@ -359,40 +359,19 @@ class TcTarget(host.TableTarget):
 
     def found(self) -> str:
         """Return the table, where the device has our qdisc."""
-        device, root = self._device, self._root()
-        if root is None:
-            raise ProgrammingError(
-                f"cannot find device {device!r} on this host", hint="see: ip link"
-            )
-        if root.handle == "0:":  # what the kernel gave it
-            return ""
-        if root.handle != OWNED_HANDLE:
-            raise ProgrammingError(
-                f"cannot use {self.name}: it has a root qdisc of another owner, {root.kind} "
-                f"{root.handle}",
-                hint=f"use another device, or remove it: tc qdisc del dev {device} root",
-            )
-        table = self.listing()
-        if self._ledger.find(self._record) is None and not table:
-            raise ProgrammingError(
-                f"cannot use {self.name}: its root qdisc {root.handle} was made by lifecycle, but "
-                f"not for system {self._ledger.system!r} of this user",
-                hint="if nothing uses it any more: "
-                f"tc qdisc del dev {device} root handle {root.handle}",
-            )
-        return f"{OWNED_HANDLE}\n{table}"
+        return f"{OWNED_HANDLE}\n{self.listing()}" if self._own_root() else ""
 
     def write(self, wanted: host.Wanted, *, anew: bool) -> None:
         """Write the table, and before it the qdisc and its classes anew."""
         if anew:
-            self.clear()
+            if self._is_ours():
+                self.clear()
             self._batch(wanted.beside)
         self.write_table(wanted.table)
 
     def clear(self) -> bool:
         """Delete our qdisc and our table, where they are."""
-        root = self._root()
-        ours = root is not None and root.handle == OWNED_HANDLE
+        ours = self._is_ours()
         if ours:
             self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
         return super().clear() or ours
@@ -406,6 +385,34 @@ class TcTarget(host.TableTarget):
                 return None
             raise
         return next((each for each in listed if each.root), host.Qdisc(kind="noqueue"))
+
+    def _is_ours(self) -> bool:
+        root = self._root()
+        return root is not None and root.handle == OWNED_HANDLE
+
+    def _own_root(self) -> bool:
+        """Whether the root qdisc is ours; False if the device has only what the kernel gave it."""
+        device, root = self._device, self._root()
+        if root is None:
+            raise ProgrammingError(
+                f"cannot find device {device!r} on this host", hint="see: ip link"
+            )
+        if root.handle == "0:":
+            return False
+        if root.handle != OWNED_HANDLE:
+            raise ProgrammingError(
+                f"cannot use {self.name}: it has a root qdisc of another owner, {root.kind} "
+                f"{root.handle}",
+                hint=f"use another device, or remove it: tc qdisc del dev {device} root",
+            )
+        if self._ledger.find(self._record) is None and not self.listing():
+            raise ProgrammingError(
+                f"cannot use {self.name}: its root qdisc {root.handle} was made by lifecycle, but "
+                f"not for system {self._ledger.system!r} of this user",
+                hint="if nothing uses it any more: "
+                f"tc qdisc del dev {device} root handle {root.handle}",
+            )
+        return True
 
     def _batch(self, lines: str) -> None:
         host.demand(self._tool, ("tc", "-batch", "-"), doing=f"program {self.name}", stdin=lines)
