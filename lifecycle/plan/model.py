@@ -255,9 +255,7 @@ class PlannedNode(NodeDeclaration, frozen=True, kw_only=True):
         has_all_parameters: it may have no others than those, and those that ROS declares itself.
         unread_parameter_files: those whose values are not known here and so not expected.
         transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
-            to the RMW. Nodes of one process share a participant if these and `max_datagram_bytes`
-            are equal.
-        max_datagram_bytes: as in PlannedParticipant, for the node's own participant.
+            to the RMW. Nodes of one process share a participant if these are equal.
         connections: how its own participant is connected; likewise shared by equals.
         authority: SUPERVISOR: `connect` maps nothing by itself; every endpoint must have been
             mapped by `map_to`, or the transition fails and names the missing ones.
@@ -273,7 +271,6 @@ class PlannedNode(NodeDeclaration, frozen=True, kw_only=True):
     participants: tuple[PlannedParticipant, ...]
     endpoint_policy: EndpointPolicy
     transports: tuple[_UdpUnicast, ...] = ()
-    max_datagram_bytes: Positive | None = None
     connections: ParticipantConnections = ParticipantConnections()
     authority: Authority = Authority.NODES
     events: bool = False

@@ -37,13 +37,11 @@ def variables_of(plan: Plan) -> tuple[tuple[str, str], ...]:
     """
     server = plan.server
     if server is not None:
-        at = f"{server.address}:{server.port}"
-        if server.tcp:
-            return (
-                ("ROS_DISCOVERY_SERVER", f"TCPv4:[{server.address}]:{server.port}"),
-                (TRANSPORTS_VARIABLE, "NONE"),
-            )
-        return (("ROS_DISCOVERY_SERVER", at), (TRANSPORTS_VARIABLE, "UDPv4"))
+        at = f"TCPv4:[{server.address}]" if server.tcp else server.address
+        return (
+            ("ROS_DISCOVERY_SERVER", f"{at}:{server.port}"),
+            (TRANSPORTS_VARIABLE, "NONE" if server.tcp else "UDPv4"),
+        )
     value = plan.discovery.transport.builtin
     return ((TRANSPORTS_VARIABLE, value),) if value else ()
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -92,7 +91,7 @@ class Uniqueness:
     def __init__(
         self,
         configurations: Iterable[NodeConfiguration],
-        addresses: Mapping[str, str] = MappingProxyType({}),
+        addresses: Mapping[str, str],
     ) -> None:
         self._entries: dict[_Place, _Entry] = {}
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those

@@ -180,18 +180,9 @@ class DeclaredNames(msgspec.Struct, frozen=True):
         """Return whether an endpoint of an undeclared node would feed or serve the system."""
         if not kind.offers or (kind, name) in NOISE_TOPICS:
             return False
-        return (
-            self.has(kind, name) or self._is_own(kind, name) or self.is_of_supervisors(kind, name)
-        )
-
-    def _is_own(self, kind: EndpointKind, name: str) -> bool:
-        """Return whether every node offers this under its own name, and it is a declared node's."""
         node, _, base = name.rpartition("/")
-        return node in self.nodes and base in _OWN.get(kind, ())
-
-    def is_of_supervisors(self, kind: EndpointKind, name: str) -> bool:
-        """Return whether only a supervisor of the plan may offer an endpoint."""
-        return (kind, name) in self.of_supervisors
+        is_own = node in self.nodes and base in _OWN.get(kind, ())
+        return self.has(kind, name) or is_own or (kind, name) in self.of_supervisors
 
     def looks_for(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
@@ -214,6 +205,7 @@ _OWN: Mapping[EndpointKind, Collection[str]] = {
     EndpointKind.SERVICE_SERVER: NODE_SERVICES.keys() | OUR_SERVICES.keys(),
     EndpointKind.PUBLISHER: NODE_TOPICS.keys(),
 }
+"""What every node offers under its own name."""
 
 
 def known_node(full_name: str) -> str:
@@ -526,15 +518,11 @@ def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dic
         prefixes = {one.prefix for one in each.connections}
         prefixes |= {one.gid[:PREFIX_DIGITS] for one in each.endpoints}
         owner = Owner(each.name, frozenset(prefixes - {""}))
-        found |= {_beside(each.name, name): owner for name in hidden}
+        namespace = each.name.rpartition("/")[0]
+        found |= {f"{namespace}/{name}": owner for name in hidden}
     return found
 
 
 def is_hidden_node(full_name: str) -> bool:
     """Whether a node is hidden by the convention of ROS 2: its name begins with an underscore."""
     return full_name.rpartition("/")[2].startswith("_")
-
-
-def _beside(full_name: str, base: str) -> str:
-    """Return the full name of a node in the namespace of another."""
-    return f"{full_name.rpartition('/')[0]}/{base}"

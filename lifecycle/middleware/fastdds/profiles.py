@@ -242,10 +242,11 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             ConnectionUrlError: a URL that is none.
             MiddlewareError: what one participant cannot have together.
         """
+        extra = planned if isinstance(planned, PlannedParticipant) else None
         return cls(
             transports=planned.transports,
-            max_datagram_bytes=planned.max_datagram_bytes,
-            non_blocking_send=isinstance(planned, PlannedParticipant) and planned.non_blocking_send,
+            max_datagram_bytes=extra.max_datagram_bytes if extra else None,
+            non_blocking_send=extra is not None and extra.non_blocking_send,
             connections=planned.connections,
         )
 

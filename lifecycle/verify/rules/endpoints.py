@@ -375,7 +375,7 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
         if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
             continue
         word = endpoint.kind.noun
-        of_supervisor = view.names.is_of_supervisors(endpoint.kind, endpoint.name)
+        of_supervisor = (endpoint.kind, endpoint.name) in view.names.of_supervisors
         verb = "feeds" if endpoint.kind.is_topic else "serves"
         whom = "whoever asks for the supervisor" if of_supervisor else "the system"
         yield UNDECLARED[endpoint.kind].finding(
@@ -401,9 +401,9 @@ def _unattributed(view: View) -> Iterator[Finding]:
     """
     for endpoint in view.unattributed:
         word = endpoint.kind.noun
-        feeds = view.names.fed_by(endpoint.kind, endpoint.name)
-        # The supervisor of another machine begins to offer them after its gate.
-        feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
+        place, names = (endpoint.kind, endpoint.name), view.names
+        # The supervisor of another machine begins to offer what is its own after its gate.
+        feeds = names.fed_by(*place) and place not in names.of_supervisors
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
             outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
@@ -113,10 +113,11 @@ def match(
     ]
     if not answers:
         return None
-    if any(outcome is Outcome.VIOLATED for outcome, _ in answers):
-        return _worst(answers)
-    # A match has two ends: one whose count is that of all who can match it proves the pair.
-    return _OK if _OK in answers else _worst(answers)
+    worst = Outcome.worst(outcome for outcome, _ in answers)
+    if worst is not Outcome.VIOLATED and _OK in answers:
+        return _OK  # a count that is that of all who can match one end proves the pair
+    reasons = dict.fromkeys(reason for outcome, reason in answers if outcome is worst)
+    return worst, ", ".join(reasons)
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -193,13 +194,18 @@ def is_unreported(flow: FlowView) -> bool:
 
 
 def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
-    cause = _cause(flow)
-    if cause and not flow.planned.linked:
-        return  # the cause has its own finding already
-    outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow, ends)
-    if outcome is Outcome.OK:
-        return
-    rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
+    linked = flow.planned.linked
+    if cause := _cause(flow):
+        outcome, reason = Outcome.VIOLATED, cause
+    else:
+        writer, reader = flow.endpoints
+        outcome, reason = match(writer, reader, *ends) or (
+            Outcome.UNVERIFIABLE if linked else Outcome.OK,
+            "neither end reports whom it is matched with",
+        )
+    if outcome is Outcome.OK or (cause and not linked):
+        return  # a cause has its own finding already
+    rule = UNMATCHED_LINK if linked else UNMATCHED_FLOW
     violated = outcome is Outcome.VIOLATED
     pair = f"{flow.publisher} → {flow.subscription}"
     yield rule.on(
@@ -224,23 +230,6 @@ def _cause(flow: FlowView) -> str:
         if end.observed is None and not end.beyond:
             return f"the {word} is missing"
     return obstacle(*flow.endpoints)
-
-
-def _judge(flow: FlowView, ends: _Ends) -> Match:
-    """Return what is known of a flow of which both ends are seen."""
-    writer, reader = flow.endpoints
-    if answer := match(writer, reader, *ends):
-        return answer
-    unknown = Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"
-    return unknown if flow.planned.linked else _OK
-
-
-def _worst(answers: Iterable[Match]) -> Match:
-    """Return the worst outcome with every reason for it."""
-    found = list(answers)
-    outcome = Outcome.worst(each for each, _ in found)
-    reasons = dict.fromkeys(reason for each, reason in found if each is outcome)
-    return outcome, ", ".join(reasons)
 
 
 def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | None:
