@@ -46,9 +46,7 @@ def laid_out(
 ) -> tuple[Uniqueness, dict[str, Actual]]:
     view = lay_out(plan, edit(perfect(plan)), Stage.CONNECTED)
     ends = {each.planned.resolved: each for each in view.actual}
-    if addresses is None:
-        return Uniqueness(view.reported), ends
-    return Uniqueness(view.reported, addresses), ends
+    return Uniqueness(view.reported, addresses or {}), ends
 
 
 def unique(
@@ -194,12 +192,13 @@ def by_comparing(nfes, others) -> bool | None:
 @given(st.lists(ENDS, max_size=8))
 def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
     reports = [reported(kind, f"e{i}", nfes=nfes) for i, (kind, _, nfes) in enumerate(ends)]
-    uniqueness = Uniqueness(
+    described = [
         configuration(
             f"/n{index}", each, identity=Identity(machine_id=host, process_id=pid, node_id="")
         )
         for index, (each, (_, (host, pid), _)) in enumerate(zip(reports, ends, strict=True))
-    )
+    ]
+    uniqueness = Uniqueness(described, {})
     for index, (kind, process, nfes) in enumerate(ends):
         others = [
             located(each, place[0])
