@@ -62,6 +62,7 @@ class Networks:
         self._emit = emit
         self._programmer = programmer
         self._flows: tuple[FlowReport, ...] = ()
+        self._told: set[str] = set()  # what is left out, and why
         self._begun = False
         self._changed = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
@@ -189,7 +190,9 @@ class Networks:
             loop.call_soon_threadsafe(self._report, text)
 
         async with self._one_at_a_time:
-            task = loop.run_in_executor(self._thread, _once, programmer, self._flows, within_s, say)
+            task = loop.run_in_executor(
+                self._thread, _once, programmer, self._flows, within_s, say, self._told
+            )
             try:
                 return await asyncio.shield(task)
             except asyncio.CancelledError:
@@ -204,11 +207,16 @@ def _once(
     flows: Sequence[FlowReport],
     within_s: float | None,
     say: Callable[[str], None],
+    told: set[str],
 ) -> float | None:
-    """Program flows, in a thread; return the seconds until something expires."""
+    """Program flows, in a thread; return the seconds until something expires.
+
+    What is done is said, and what is left out and was not `told` yet.
+    """
     until_s = None if within_s is None else time.monotonic() + within_s
     for each in programmer.update(flows, hold=True, within_s=within_s):
-        if each.pending:
+        if each.pending or not told.issuperset(each.left_out):
+            told.update(each.left_out)
             say(each.render(done=True))
     return programmer.renew(within_s=None if until_s is None else until_s - time.monotonic())
 

@@ -40,9 +40,14 @@ REAL_TIME = True
 
 
 class FakePrograms:
-    """A Programmer that notes what it is asked, and fails as often as told."""
+    """A Programmer that notes what it is asked, and fails as often as told.
 
-    def __init__(self) -> None:
+    Args:
+        left_out: why its target can do nothing for these flows, if so.
+    """
+
+    def __init__(self, *left_out: str) -> None:
+        self._left_out = left_out
         self.seen: list[tuple[str, ...]] = []
         self.fail = 0
         self.plans: list[Plan] = []
@@ -67,7 +72,8 @@ class FakePrograms:
         self.seen.append(topics)
         self._loop.call_soon_threadsafe(self.asked.set)  # last: who is woken looks at `seen`
         change = FlowChange(kind=ChangeKind.CREATE, key="k", what="w")
-        return (TargetChanges(target="fake", changes=(change,)),)
+        changes = () if self._left_out else (change,)
+        return (TargetChanges(target="fake", changes=changes, left_out=self._left_out),)
 
     def renew(self, *, within_s: float | None) -> float | None:
         return None
@@ -106,6 +112,18 @@ class Notices:
     def _take(self, event: object) -> None:
         if isinstance(event, Notice):
             self.said.append(event.message)
+
+
+async def test_a_flow_that_a_target_can_do_nothing_for_is_said_once(tmp_path: Path) -> None:
+    notices = Notices()
+    networks = Networks(
+        "s", tmp_path, notices.emit, FakePrograms("/a: it never leaves its machine")
+    )
+    await networks.begin(verdict("/a"))
+    await networks.begin(verdict("/a", "/b"))
+    await asyncio.sleep(0)
+    assert notices.said == ["fake: 0 unchanged\n  left out: /a: it never leaves its machine"]
+    await networks.close(asyncio.Event())
 
 
 async def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the_end(
