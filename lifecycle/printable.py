@@ -16,10 +16,17 @@ from collections.abc import Sequence
 _COLOUR = re.compile("\x1b\\[[0-9;:]*m")
 """SGR (ECMA-48 §8.3.117): it changes how text looks, and nothing else."""
 
+_BREAK = re.compile(r"([:;,.]?)\n\s*")
+
 
 def one_line(text: str) -> str:
     """Return a text that is one line of printable characters."""
     return text if text.isprintable() else "".join(map(_escaped, text))
+
+
+def sentence(text: str) -> str:
+    """Return a text that may have several lines as one, of printable characters."""
+    return one_line(_BREAK.sub(lambda found: f"{found[1] or ';'} ", text))
 
 
 def lines(text: str) -> str:

@@ -13,7 +13,7 @@ from lifecycle.cli.common import say
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.verbs.control import status_head
 from lifecycle.node.host.control import Operation
-from lifecycle.printable import count, json_text, log_line, one_line
+from lifecycle.printable import count, json_text, log_line, one_line, sentence
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.run import events
 from lifecycle.supervisor.run.options import UpResult
@@ -208,7 +208,7 @@ def describe(event: events.Event) -> str | None:
     if isinstance(event, events.LogLine):
         return log_line(f"[{event.process}] {event.line}")
     text = _sentence(event)
-    return None if text is None else one_line(text)
+    return None if text is None else sentence(text)
 
 
 def _sentence(event: events.Event) -> str | None:  # noqa: PLR0911, PLR0912 - one case for each kind

@@ -25,7 +25,7 @@ from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA
 from lifecycle.plan.model import Plan
-from lifecycle.printable import columns, json_text, one_line
+from lifecycle.printable import columns, json_text, one_line, sentence
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES, rule
 from lifecycle.verify.verdict import Finding, FlowReport, RunEnd, Verdict
@@ -111,7 +111,7 @@ def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
 def _wrap(text: str, width: int, *, first: str = "") -> list[str]:
     """Wrap at spaces only: names and addresses stay whole. `first` starts the first line."""
     return textwrap.wrap(
-        one_line(text),
+        sentence(text),
         width,
         initial_indent=first,
         subsequent_indent=" " * len(first),

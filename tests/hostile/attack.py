@@ -97,12 +97,14 @@ class HostileClass:
         attacks: makes them; equal for equal seeds.
         stage: a context that they share, a running system, say; it is given those that were chosen.
         limit_s: seconds for the whole class.
+        has_host: with root it runs on a host of its own, whose address is HOSTILE_HOST.
     """
 
     name: str
     attacks: Callable[[random.Random], list[Attack]]
     stage: Callable[[Place, Sequence[Attack]], AbstractContextManager[Any]] = _bare
     limit_s: float = 240.0
+    has_host: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

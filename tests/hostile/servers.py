@@ -83,6 +83,10 @@ def _adapter(kind: str, behave: Behave, place: Place) -> None:
 
 def _system(place: Place, folder: Path, **edit: Any) -> Path:
     needs = {
+        "machines": {"robot": {"address": os.environ["HOSTILE_HOST"]}},
+        "nodes/talker/machine": "robot",
+        "nodes/listener/machine": "robot",
+        "discovery/range": "subnet",
         "nodes/talker/flows": {"publishers": {"chatter": {"five_qi": 85, "transport": "network"}}},
         **edit,
     }
@@ -168,6 +172,8 @@ def attacks(rng: random.Random) -> list[Attack]:
     for index in range(40):
         body = mutated(json.dumps(SESSION).encode(), rng)
         add(f"session changed {index}", _adapter, "camara", answers(body))
+    if "HOSTILE_HOST" not in os.environ:
+        return found  # a flow within a machine concerns no mobile network
     # The long ones last.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         add(f"up and {number.name}: the server drips", _up, SLOW["drips its status"], number)
@@ -176,4 +182,4 @@ def attacks(rng: random.Random) -> list[Attack]:
     return found
 
 
-CLASS = HostileClass(name="servers", attacks=attacks, limit_s=420.0)
+CLASS = HostileClass(name="servers", attacks=attacks, limit_s=420.0, has_host=True)

@@ -8,7 +8,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.printable import columns, json_text, lines, log_line, one_line
+from lifecycle.printable import columns, json_text, lines, log_line, one_line, sentence
 
 ANY = st.text(st.characters())
 
@@ -23,6 +23,15 @@ def test_what_is_not_is_written_as_python_escapes_it():
 
 def test_only_a_newline_ends_a_line():
     assert lines("a\nb\u2028c\x85d\re") == "a\nb\\u2028c\\x85d\\re"
+
+
+def test_several_lines_become_one_sentence():
+    text = (
+        "nef: 0 unchanged\n  left out: a\ncannot make 1 of 2 changes to nef:\n  POST: no answer\x1b"
+    )
+    assert sentence(text) == (
+        "nef: 0 unchanged; left out: a; cannot make 1 of 2 changes to nef: POST: no answer\\x1b"
+    )
 
 
 def test_the_colours_of_a_log_line_are_left_out_and_its_commands_are_shown():

@@ -12,7 +12,7 @@ import click
 from lifecycle.cli import common
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.measure.flows import measured_summary
-from lifecycle.printable import columns, count, one_line
+from lifecycle.printable import columns, count, one_line, sentence
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -130,7 +130,7 @@ def _history(node: NodeStatus) -> str:
         parts.append(f"restarted {count(node.restarts, 'time')}")
     if (last := node.last_failure) is not None:
         stderr = f" ({last.stderr})" if last.stderr else ""
-        parts.append(f"last failure {last.at}: {last.message}{stderr}")
+        parts.append(f"last failure {last.at}: {sentence(last.message)}{stderr}")
     return "; ".join(parts)
 
 

@@ -13,7 +13,7 @@ import click
 from lifecycle.cli.common import completing, format_option, say
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text, one_line
+from lifecycle.printable import json_text, one_line, sentence
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.run.journal import RecordedRun
@@ -90,7 +90,7 @@ def _timeline(recorded: RecordedRun) -> Iterator[str]:
             now = {(one.outcome, one.rule, one.subject) for one in found}
             for one in found:
                 if (one.outcome, one.rule, one.subject) not in known:
-                    yield one_line(f"    + {one.outcome.value} {one.rule}: {one.message}")
+                    yield sentence(f"    + {one.outcome.value} {one.rule}: {one.message}")
             for outcome, rule, subject in sorted(known - now, key=lambda gone: gone[1:]):
                 yield one_line(f"    - {outcome.value} {rule}: {subject}")
     if not over and recorded.moments:
