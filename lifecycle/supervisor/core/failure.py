@@ -7,7 +7,6 @@ for people, and how a run ends: `end` and the exit code. Pure.
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Iterable
 
 from msgspec.structs import replace
@@ -131,8 +130,11 @@ def _not_run(process: Process, given: Exited) -> str:
 
 def forced(process: Process) -> Event:
     """Return what is said of a process that did not end when it was asked to."""
-    name = signal.Signals(process.sent[-1]).name
+    name = _SIGNALS.get(process.sent[-1], str(process.sent[-1]))
     return Notice(message=f"process {process.name!r} had to be ended with {name}")
+
+
+_SIGNALS = {2: "SIGINT", 9: "SIGKILL", 15: "SIGTERM"}
 
 
 def activated(node: Node) -> Event:
