@@ -1,4 +1,4 @@
-"""Counts what arrives at one subscription: some microseconds a message.
+"""Counts what arrives at one subscription: constant memory, some microseconds a message.
 
 Owns: what is noted as a message arrives, the slots in which it is counted later, in another thread,
 and for how long they are kept. What is noted costs the callback's thread as little as possible. The
@@ -8,10 +8,22 @@ clock is the caller's.
 from __future__ import annotations
 
 import threading
+from collections import Counter as Counts
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, SLOT_S, Delays, Sample, Slot
+from lifecycle.measure.sample import (
+    DELAY_MESSAGES,
+    DELAY_S,
+    LONGEST_NS,
+    SLOT_S,
+    Delays,
+    Sample,
+    Slot,
+    buckets_of,
+    least_ns,
+    signed_buckets_of,
+)
 
 WARM_UP_S = 0.5
 """What arrives so soon after activation is not counted: others are being activated meanwhile."""
@@ -28,6 +40,10 @@ _MOST_NOTED = 64
 _UNNUMBERED = 1 << 63
 """RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED is larger, no sequence number is."""
 
+_APART_NS = 1 << 26
+"""Delays of another clock that are further from their shift, about 67 ms, get another one: their
+buckets would be larger than a millisecond."""
+
 _NS = 1e9
 _SLOT_NS = int(SLOT_S * _NS)
 
@@ -41,11 +57,14 @@ class Counter:
         now_ns: on a clock that only goes forward; counting begins WARM_UP_S later.
         wall_ns: then, on the clock of the source timestamps; what was published before does not
             count.
-        is_apart: the source timestamps are of another host's clock, or of several.
+        is_apart: the source timestamps are of another host's clock, or of several: delays are
+            counted by how much longer they are than a short one, their shift.
     """
 
     def __init__(self, now_ns: int, wall_ns: int, *, is_apart: bool = False) -> None:
         self.is_apart = is_apart
+        self._shift_ns: int | None = None
+        self._buckets_of = signed_buckets_of if is_apart else buckets_of
         self._lock = threading.Lock()
         self._noted: deque[_Noted] = deque()
         self._published_ns = wall_ns + int(WARM_UP_S * _NS)
@@ -54,11 +73,13 @@ class Counter:
         self._messages = 0
         self._lost: int | None = 0
         self._levels: list[deque[Slot]] = [deque() for _ in range(_LEVELS)]
-        # Of the last slots, nanoseconds: until the callback, and where it is known until reception.
-        self._delays: deque[tuple[list[int], list[int]]] = deque(maxlen=round(DELAY_S / SLOT_S))
-        self._used: list[int] = []
-        self._received: list[int] = []
-        self._slot_lost = 0
+        self._delays: deque[tuple[Counts[int], Counts[int]]] = deque(maxlen=round(DELAY_S / SLOT_S))
+        self._open()
+
+    def _open(self) -> None:
+        self._slot_messages = self._slot_lost = 0
+        self._used: Counts[int] = Counts()
+        self._received: Counts[int] = Counts()
 
     def arrived(self, now_ns: int, wall_ns: int, info: Mapping[str, int]) -> None:
         """Note a message, at the start of its callback, with its rmw_message_info_t."""
@@ -69,63 +90,108 @@ class Counter:
     def count(self) -> None:
         """Count what was noted; from any thread."""
         with self._lock:
-            last, last_ns = self._last_number, self._last_ns
-            for _ in range(len(self._noted)):
-                now_ns, wall_ns, info = self._noted.popleft()
-                source_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
-                before, last = last, info["publication_sequence_number"]
-                # When it was published is not known by another clock, but when it was received.
-                at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
-                # Its own clock may have been set back since.
-                if at_ns < self._published_ns <= wall_ns or now_ns < self._since_ns:
-                    continue
-                self._close_slots(now_ns)
-                if not 0 < last < _UNNUMBERED:
-                    self._lost = None
-                elif (
-                    0 < before < last and self._lost is not None
-                ):  # else its publisher is a new one
-                    self._lost += last - before - 1
-                    self._slot_lost += last - before - 1
-                self._messages += 1
-                self._used.append(wall_ns - source_ns)
-                if received_ns > 0:
-                    self._received.append(received_ns - source_ns)
-                last_ns = now_ns
-            self._last_number, self._last_ns = last, last_ns
+            self._count([self._noted.popleft() for _ in range(len(self._noted))])
 
     def sample(self, now_ns: int) -> Sample:
         """Count what was noted, and return what is known now; from any thread."""
         self.count()
         with self._lock:
             self._close_slots(now_ns)
-            used, received = (
-                Delays.of(
-                    (delay for slot in self._delays for delay in slot[which]),
-                    seconds=len(self._delays) * SLOT_S,
-                    is_apart=self.is_apart,
-                )
-                for which in (0, 1)
-            )
+            slots = tuple(each for level in self._levels for each in level)
+            used, received = self._recent()
             return Sample(
                 seconds=max(0.0, (now_ns - self._since_ns) / _NS),
                 silent_s=max(0.0, (now_ns - self._last_ns) / _NS),
                 messages=self._messages,
                 lost=self._lost,
-                slots=tuple(each for level in self._levels for each in level),
+                slots=slots,
                 used=used,
                 received=received,
             )
+
+    def _recent(self) -> tuple[Delays, Delays]:
+        chosen: list[tuple[Counts[int], Counts[int]]] = []
+        messages = 0
+        for each in reversed(self._delays):
+            chosen.append(each)
+            messages += sum(each[0].values())
+            if messages >= DELAY_MESSAGES:
+                break
+        seconds = len(chosen) * SLOT_S
+        return (
+            Delays.of((each[0] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
+            Delays.of((each[1] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
+        )
+
+    def _count(self, noted: Iterable[_Noted]) -> None:
+        used, received = list[int](), list[int]()
+        last, last_ns = self._last_number, self._last_ns
+        for now_ns, wall_ns, info in noted:
+            source_ns, received_ns = info["source_timestamp"], info["received_timestamp"]
+            before, last = last, info["publication_sequence_number"]
+            # When it was published is not known by another clock, but when it was received.
+            at_ns = (received_ns or wall_ns) if self.is_apart else source_ns
+            # Its own clock may have been set back since.
+            if at_ns < self._published_ns <= wall_ns or now_ns < self._since_ns:
+                continue
+            if now_ns >= self._slot_ns + _SLOT_NS:
+                self._add(used, received)
+                used, received = [], []
+                self._close_slots(now_ns)
+            if last != before + 1:
+                self._skip(before, last)
+            used.append(wall_ns - source_ns)
+            if received_ns > 0:
+                received.append(received_ns - source_ns)
+            last_ns = now_ns
+        self._last_number, self._last_ns = last, last_ns
+        self._add(used, received)
+
+    def _skip(self, before: int, number: int) -> None:
+        if not 0 < number < _UNNUMBERED:
+            self._lost = None
+        elif 0 < before < number and self._lost is not None:  # else its publisher is a new one
+            self._lost += number - before - 1
+            self._slot_lost += number - before - 1
+
+    def _add(self, used: list[int], received: list[int]) -> None:
+        if not used:
+            return
+        self._messages += len(used)
+        self._slot_messages += len(used)
+        if self.is_apart:
+            used, received = self._shifted(used, received)
+        self._used.update(self._buckets_of(used))
+        self._received.update(self._buckets_of(received))
+
+    def _shifted(self, used: list[int], received: list[int]) -> tuple[list[int], list[int]]:
+        """Return by how much delays are longer than a short one."""
+        least = min(used)
+        shift = self._shift_ns = least if self._shift_ns is None else self._shift_ns
+        if not (least - shift > -_APART_NS and max(used) - shift < LONGEST_NS):
+            self._move_shift(least - shift)
+            shift = least
+        return [each - shift for each in used], [each - shift for each in received]
+
+    def _move_shift(self, by_ns: int) -> None:
+        self._shift_ns = (self._shift_ns or 0) + by_ns
+        kept = (counts for slot in self._delays for counts in slot)
+        for counts in (self._used, self._received, *kept):
+            before = tuple(counts.items())
+            counts.clear()
+            for bucket, number in before:
+                (moved,) = signed_buckets_of((least_ns(bucket) - by_ns,))
+                counts[moved] += number
 
     def _close_slots(self, now_ns: int) -> None:
         while now_ns - self._slot_ns >= _SLOT_NS:
             self._slot_ns += _SLOT_NS
             self._delays.append((self._used, self._received))
-            self._keep(Slot(seconds=SLOT_S, messages=len(self._used), lost=self._slot_lost))
-            self._used, self._received, self._slot_lost = [], [], 0
-            # What is judged are the last so many.
-            while sum(len(used) for used, _ in list(self._delays)[1:]) >= DELAY_MESSAGES:
-                self._delays.popleft()
+            self._keep(Slot(seconds=SLOT_S, messages=self._slot_messages, lost=self._slot_lost))
+            self._open()
+            lately = [min(used) for used, _ in self._delays if used][-2:]
+            if self.is_apart and len(lately) > 1 and least_ns(min(lately)) > _APART_NS:
+                self._move_shift(least_ns(min(lately)))
 
     def _keep(self, slot: Slot) -> None:
         for level in self._levels:

@@ -36,15 +36,26 @@ def buckets_of(delays_ns: Iterable[int]) -> list[int]:
     ]
 
 
+def signed_buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of differences of two delays, which may be negative."""
+    return [
+        bucket if each >= 0 else -bucket
+        for each in delays_ns
+        for bucket in buckets_of((abs(each),))
+    ]
+
+
 def least_ns(bucket: int) -> int:
     """Return the shortest delay of a bucket."""
+    if bucket < 0:
+        return 1 - least_ns(1 - bucket)
     shift = max((bucket >> _PART_BITS) - 1, 0)
     return (bucket - (shift << _PART_BITS)) << shift
 
 
 (LAST_BUCKET,) = buckets_of((LONGEST_NS,))
 
-Bucket = Annotated[int, msgspec.Meta(ge=0, le=LAST_BUCKET)]
+Bucket = Annotated[int, msgspec.Meta(ge=-LAST_BUCKET, le=LAST_BUCKET)]
 
 
 class Delays(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,9 +64,9 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         seconds: how long it took them all to arrive.
         buckets: those with delays in them, in order, and how many there are in each.
-        shift_ns: added to each of those of a publisher on another host: the shortest of them, as
-            how far its clock is ahead is not known where they are counted, and small delays have
-            small buckets; None where all are of one clock.
+        shift_ns: added to each of those of a publisher on another host: how far its clock is ahead
+            is not known where they are counted, and small delays have small buckets; None where
+            all are of one clock.
     """
 
     seconds: float = 0.0
@@ -64,16 +75,19 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(
-        cls, delays_ns: Iterable[int], *, seconds: float = 0.0, is_apart: bool = False
+        cls,
+        counts: Iterable[dict[int, int]],
+        *,
+        seconds: float = 0.0,
+        shift_ns: int | None = None,
     ) -> Delays:
-        """Count delays, of a publisher on another host where it `is_apart`."""
-        delays = tuple(delays_ns)
-        shift_ns = min(delays, default=0) if is_apart else None
-        counts: dict[int, int] = {}
-        for each in buckets_of(one - (shift_ns or 0) for one in delays):
-            bucket = min(each, LAST_BUCKET)
-            counts[bucket] = counts.get(bucket, 0) + 1
-        return cls(seconds=seconds, buckets=tuple(sorted(counts.items())), shift_ns=shift_ns)
+        """Add up histograms, each the number of delays by bucket."""
+        total: dict[int, int] = {}
+        for each in counts:
+            for found, number in each.items():
+                bucket = max(-LAST_BUCKET, min(found, LAST_BUCKET))
+                total[bucket] = total.get(bucket, 0) + number
+        return cls(seconds=seconds, buckets=tuple(sorted(total.items())), shift_ns=shift_ns)
 
     @property
     def messages(self) -> int:

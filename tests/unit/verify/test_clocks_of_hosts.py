@@ -14,7 +14,7 @@ from lifecycle.manifest.model import EndpointKind, Machine, Policy, Quantity
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.flows import CLOCKS_S
-from lifecycle.measure.sample import Delays, Measured, Sample, buckets_of
+from lifecycle.measure.sample import Delays, Measured, Sample, signed_buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import apart_from_numbers, verify, with_measured
 from lifecycle.verify.observation import Identity
@@ -57,7 +57,7 @@ def judged(
 ) -> Verdict:
     """Judge as the supervisor of a machine does; delays are those of the robot at +512 ms."""
     raw_ns = round(delay_ms * MS) - 512 * MS - SHIFT_NS
-    used = Delays(seconds=5.0, buckets=((buckets_of((raw_ns,))[0], 300),), shift_ns=shift_ns)
+    used = Delays(seconds=5.0, buckets=((signed_buckets_of((raw_ns,))[0], 300),), shift_ns=shift_ns)
     sample = Sample(seconds=seconds, messages=300, used=used, received=used)
     return verified(plan, sample, clocks if is_up else None, own)
 
@@ -151,7 +151,7 @@ def test_only_the_supervisor_of_the_subscription_judges() -> None:
 
 def test_one_host_has_one_clock_whatever_its_machines_are_called() -> None:
     plan = system(viewer="robot")
-    used = Delays(seconds=5.0, buckets=((buckets_of((MS,))[0], 300),))
+    used = Delays(seconds=5.0, buckets=((signed_buckets_of((MS,))[0], 300),))
     verdict = judged(plan, own="robot", shift_ns=None)
     assert verdict.measured[0].clock is None
     assert used.quantile_ms(0.99) is not None

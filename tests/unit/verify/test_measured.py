@@ -14,7 +14,7 @@ from lifecycle.manifest.model import (
     RunKind,
     TargetState,
 )
-from lifecycle.measure.sample import Delays, Measured, Sample, Slot
+from lifecycle.measure.sample import Delays, Measured, Sample, Slot, buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import without_measured
 from lifecycle.verify.observation import Observation
@@ -51,7 +51,8 @@ def pair(*of_link: Quantity, run: Run | None = None, **ends: tuple[Quantity, ...
 def arrived(
     messages: int, seconds: float, *, delay_ms: float = 1.0, lost: int = 0, silent_s: float = 0.0
 ) -> Sample:
-    delays = Delays.of([round(delay_ms * 1e6)] * messages, seconds=min(seconds, 5.0))
+    histogram = {buckets_of((round(delay_ms * 1e6),))[0]: messages} if messages else {}
+    delays = Delays.of((histogram,), seconds=min(seconds, 5.0))
     slot = Slot(seconds=seconds, messages=messages, lost=lost)
     return Sample(
         seconds=seconds,
@@ -128,8 +129,8 @@ def test_what_cannot_be_decided_yet_is_shown_and_counts_for_nothing() -> None:
 
 
 def test_what_has_arrived_of_a_flow_is_shown_in_numbers() -> None:
-    delays_ms = [1] * 985 + [5] * 10 + [9] * 5
-    used = Delays.of((each * 1_000_000 for each in delays_ms), seconds=5.0)
+    (of_1, of_5, of_9) = (buckets_of((each * 1_000_000,))[0] for each in (1, 5, 9))
+    used = Delays.of(({of_1: 985, of_5: 10, of_9: 5},), seconds=5.0)
     sample = replace(arrived(1000, 10, lost=3), used=used)
     plan = pair(number("max_delay_ms", 5), number("loss", 0.001))
     (flow,) = judged(plan, sample).measured
