@@ -135,7 +135,8 @@ class ServiceCalls:
     async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
         """Return a client matched with all servers, or long enough with some; None if none came.
 
-        What the server of an ended process is sent, which discovery shows still, nobody answers.
+        A server of an ended process does not count, although discovery shows it until its lease
+        ends: a request to it is lost.
         """
         loop = asyncio.get_running_loop()
         offered_s: float | None = None

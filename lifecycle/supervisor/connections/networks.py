@@ -62,7 +62,7 @@ class Networks:
         self._emit = emit
         self._programmer = programmer
         self._flows: tuple[FlowReport, ...] = ()
-        self._told: set[str] = set()  # what is left out, and why
+        self._left_out: set[str] = set()  # what is left out, and why
         self._begun = False
         self._changed = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
@@ -191,7 +191,7 @@ class Networks:
 
         async with self._one_at_a_time:
             task = loop.run_in_executor(
-                self._thread, _once, programmer, self._flows, within_s, say, self._told
+                self._thread, _once, programmer, self._flows, within_s, say, self._left_out
             )
             try:
                 return await asyncio.shield(task)
@@ -207,16 +207,16 @@ def _once(
     flows: Sequence[FlowReport],
     within_s: float | None,
     say: Callable[[str], None],
-    told: set[str],
+    reported: set[str],
 ) -> float | None:
     """Program flows, in a thread; return the seconds until something expires.
 
-    What is done is said, and what is left out and was not `told` yet.
+    What was done is reported, and what is left out unless it is among `reported`.
     """
     until_s = None if within_s is None else time.monotonic() + within_s
     for each in programmer.update(flows, hold=True, within_s=within_s):
-        if each.pending or not told.issuperset(each.left_out):
-            told.update(each.left_out)
+        if each.pending or not reported.issuperset(each.left_out):
+            reported.update(each.left_out)
             say(each.render(done=True))
     return programmer.renew(within_s=None if until_s is None else until_s - time.monotonic())
 

@@ -376,7 +376,7 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         UsageError: it runs no more, or does not answer; it was ordered nothing then.
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
-    _rouse(path)
+    _check_answers(path)
     answer = _answered(path, question, timeout_s)
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
@@ -399,8 +399,8 @@ def _asked(path: Path, question: Question, timeout_s: float) -> Answer | None:
         return None
 
 
-def _rouse(path: Path) -> None:
-    """Raise UsageError where a supervisor listens and does not answer: it was stopped, say."""
+def _check_answers(path: Path) -> None:
+    """Raise UsageError if a supervisor listens and does not answer, as after SIGSTOP."""
     try:
         _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S)
     except TimeoutError as error:
@@ -418,7 +418,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         UsageError: it does not answer, or is no supervisor of this version.
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
-    _rouse(path)
+    _check_answers(path)
     deadline = time.monotonic() + timeout_s
     patience = time.monotonic() + _STARTS_S
     question, left_s = Question(ask=ControlRequest.DOWN), timeout_s
