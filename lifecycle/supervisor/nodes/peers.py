@@ -139,7 +139,9 @@ class Peers:
         self.renew()
         if remote:
             self._announcements = [
-                self._participant.announce_alive(supervisor_alive_topic(system, each))
+                self._participant.announce_alive(
+                    supervisor_alive_topic(system, each), self._in_loop(self._ask_newcomer)
+                )
                 for each in self._own
             ]
             self._system.liveliness.listen(self._say)
@@ -299,6 +301,12 @@ class Peers:
         if carries or compares_clocks(self._system.first):
             self._notify()
             self._exchanging = self._loop.call_later(EXCHANGED_S, self._exchange)
+
+    def _ask_newcomer(self) -> None:
+        """Ask who begins to listen at once: data may congest the network soon."""
+        if self._exchanging is not None:
+            self._asks += 1
+            self._notify()
 
     def _compare(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
         """It sent a notice, having received ours."""

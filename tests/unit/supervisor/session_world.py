@@ -80,12 +80,14 @@ class FakeAir:
         self.announced: dict[str, list[Mapping[str, str]]] = {}
         self.received: list[dict[str, tuple[int, int, int]]] = []
         self.asks = 0
+        self.newcomers: list[Callable[[], None]] = []
         self.plans: list[str] = []
         self.arrives: Callable[[str], None] | None = None
         self.done: list[str] = []
 
-    def announce_alive(self, topic: str) -> SimpleNamespace:
+    def announce_alive(self, topic: str, on_listener: Callable[[], None]) -> SimpleNamespace:
         said = self.announced.setdefault(topic, [])
+        self.newcomers.append(on_listener)
 
         def notify(notice: AliveNotice) -> None:
             said.append(dict(notice.silent))

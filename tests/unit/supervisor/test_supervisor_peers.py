@@ -463,6 +463,19 @@ async def test_clocks_are_compared_once_a_second_while_a_delay_between_machines_
     assert len(robot.air.received) == 2
 
 
+async def test_clocks_are_compared_at_once_with_who_begins_to_listen(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.air.newcomers[0]()
+    await settle()
+    assert robot.air.asks == 0  # no delay between machines is declared
+    robot.system.run.first = with_delay(two_machines())
+    robot.peers.announce()
+    robot.air.newcomers[0]()
+    await settle()
+    assert robot.air.asks == 1
+    await robot.peers.close()
+
+
 async def test_who_asks_for_a_comparison_of_clocks_is_answered_at_once_and_only_once(
     tmp_path: Path,
 ) -> None:
