@@ -8,7 +8,6 @@ control channel: "Node Interface" of *Topological Discovery and Communication Ne
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -448,8 +447,7 @@ class DataLayer:
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            changed = functools.partial(self._server_changed, entity)
-            unwatch = ServerWatch(connection.node or self._node, entity, changed).stop
+            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
         return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
@@ -462,12 +460,6 @@ class DataLayer:
         if endpoint.handover is not None:
             endpoint.handover.peers_changed(_peers(endpoint))
         self._changed()  # as many peers as before may be others
-
-    def _server_changed(self, client: Any) -> None:
-        """The server of a client was matched or unmatched; in a thread of the graph."""
-        if send_held := getattr(client, "send_held", None):
-            self._turns.call_soon(send_held)
-        self._changed()
 
     def _tidy(self) -> None:
         used = [each.connection for each in self.endpoints.values()]

@@ -1,7 +1,7 @@
 """One endpoint of a node: what it is, how its rclpy entity is made, where it is, its handover.
 
 The factories of our own node are for what its author's code makes. What exists where is
-data_layer.py's. Blocking calls of what is made here raise where they would wait for ever.
+data_layer.py's.
 
 rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
@@ -10,19 +10,16 @@ something must not delay the event of a peer that appeared or left.
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from rclpy.client import Client
 from rclpy.event_handler import (
     EventHandler,
     QoSPublisherEventType,
     QoSSubscriptionEventType,
     UnsupportedEventTypeError,
 )
-from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_system_default
@@ -377,27 +374,25 @@ def _served_on(managed: Managed, endpoint: Endpoint, node: Node, *, name: str) -
     group = endpoint.options.get("callback_group") or own
     if kind.is_action:
         # Late: numpy, 100 ms.
-        from lifecycle.middleware.services.actions import GoalClient, GoalServer
+        from rclpy.action import ActionClient
+
+        from lifecycle.middleware.services.actions import GoalServer
 
         if kind is EndpointKind.ACTION_CLIENT:
-            return GoalClient(node, interface, name, group=group, refuse_to_block=refuse_to_block)
+            return ActionClient(node, interface, name, callback_group=group)
         goals = Goals(managed, endpoint)
         goals.server = GoalServer(
             node, interface, name, goals.execute, accept=goals.accept, group=group
         )
-        managed.gate.add_worker(goals.server, goals.end)
+        managed.gate.add(goals.server, goals)
         return goals.server
     options: dict[str, Any] = {"callback_group": group}
     if endpoint.planned.qos is not None:
         options["qos_profile"] = to_rclpy(endpoint.planned.qos)
     if kind is EndpointKind.SERVICE_CLIENT:
-        client = Node.create_client(node, interface, name, **options)
-        refuse_to_deadlock(client)
-        return client
+        return Node.create_client(node, interface, name, **options)
     assert endpoint.handler is not None
-    service = Node.create_service(node, interface, name, _answering(endpoint.handler), **options)
-    _survive_late_answers(managed, service, endpoint.name)
-    return service
+    return Node.create_service(node, interface, name, _answering(endpoint.handler), **options)
 
 
 def _name(managed: Managed, endpoint: Endpoint, connection: Connection) -> str:
@@ -405,24 +400,6 @@ def _name(managed: Managed, endpoint: Endpoint, connection: Connection) -> str:
     if endpoint.given_name or connection.participant is None:
         return endpoint.given_name or endpoint.name
     return resolve_name(managed.node, endpoint.kind, endpoint.name)
-
-
-def _survive_late_answers(managed: Managed, service: Any, name: str) -> None:
-    """Let an answer after its server was destroyed be lost, not end the process."""
-    send = service.send_response
-    warn = managed.log.warning
-
-    @functools.wraps(send)
-    def send_response(response: Any, header: Any) -> None:
-        try:
-            send(response, header)
-        except InvalidHandle:
-            warn(
-                f"cannot send the answer of service server {name!r}: it was "
-                "disconnected while its handler worked on it"
-            )
-
-    service.send_response = send_response
 
 
 def factory(planned: PlannedEndpoint, connection: Connection, node: Node) -> Callable[..., Any]:
@@ -453,42 +430,3 @@ def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
         return response if returned is None else returned
 
     return answer
-
-
-_SPINNING = {
-    ("rclpy.executors", "spin_once"),
-    ("rclpy.executors", "spin_once_until_future_complete"),
-    ("lifecycle.node.host.loop", "turn"),
-    ("lifecycle.node.host.loop", "_spin"),
-}
-"""Where a single-threaded executor calls back: rclpy's, and those of our own processes."""
-
-
-class DeadlockError(LifecycleError):
-    """A blocking call was made in the thread that would have to bring its answer."""
-
-
-def refuse_to_deadlock(client: Client) -> None:
-    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
-    blocking = client.call
-
-    @functools.wraps(blocking)
-    def call(*arguments: Any, **options: Any) -> Any:
-        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
-        return blocking(*arguments, **options)
-
-    client.call = call
-
-
-def refuse_to_block(what: str, instead: str) -> None:
-    """Raise DeadlockError inside the executor, where waiting for `what` would never end."""
-    # A multi-threaded executor runs callbacks in other threads than the one that spins.
-    frame = inspect.currentframe()
-    while frame is not None:
-        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
-            raise DeadlockError(
-                f"cannot wait for {what} in a callback: the answer comes by the executor that "
-                "waits for this callback",
-                hint=f"write `async def` and `await {instead}`",
-            )
-        frame = frame.f_back

@@ -32,7 +32,7 @@ from lifecycle.node.connections import (
     connections_of,
     listen_to_connections,
 )
-from lifecycle.node.endpoint import Placement, interface_name, refuse_to_deadlock, resolve_name
+from lifecycle.node.endpoint import Placement, interface_name, resolve_name
 from lifecycle.node.gate import (
     DeclaredPublisher,
     Gated,
@@ -184,8 +184,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def client(self, name: str) -> Client:
         """Return the declared service client `name`, from on_connect on.
 
-        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` raises
-        DeadlockError. Raises LifecycleError while the node is not connected.
+        In callbacks, `await self.client("reset").call_async(request)`: the blocking `call` waits
+        for the executor that waits for it. Raises LifecycleError while the node is not connected.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
 
@@ -205,7 +205,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """Return the declared action client `name`, from on_connect on; raises as `client`.
 
         In callbacks, `goal = await self.action_client("dock").send_goal_async(Dock.Goal())`, then
-        `await goal.get_result_async()`; the blocking calls raise DeadlockError.
+        `await goal.get_result_async()`; as with rclpy, a goal that no server is there for is lost.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.ACTION_CLIENT, name)
 
@@ -571,7 +571,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         if options.get("callback_group") is None:
             options["callback_group"] = self.lifecycle.turns.group
         client = super().create_client(srv_type, srv_name, **options)
-        refuse_to_deadlock(client)
         self._gated(client, None, EndpointKind.SERVICE_CLIENT)
         return client
 

@@ -365,13 +365,17 @@ class NodeLoop:
         os._exit(self._code or 1)
 
 
-def _is_of_destroyed(error: BaseException) -> bool:
-    """Return whether rclpy could not take an event, because its endpoint was destroyed since.
+_TAKING_OR_ANSWERING = {"take_data", "send_response", "_execute_goal_request"}
 
-    Its EventsExecutor has events in a queue, from which none is removed.
+
+def _is_of_destroyed(error: BaseException) -> bool:
+    """Return whether rclpy could not take or answer something, as its endpoint was destroyed since.
+
+    An async handler may have worked on it meanwhile, and rclpy's EventsExecutor has events in a
+    queue, from which none is removed.
     """
     *_, last = traceback.extract_tb(error.__traceback__)
-    return isinstance(error, InvalidHandle) and last.name == "take_data"
+    return isinstance(error, InvalidHandle) and last.name in _TAKING_OR_ANSWERING
 
 
 @contextlib.contextmanager
