@@ -183,8 +183,9 @@ def _find_command(run: Run, environment: Mapping[str, str]) -> None:
 
 
 def _find_file(what: str, file: Path) -> None:
-    if not file.exists():
-        hint = did_you_mean(file.name, sorted(each.name for each in file.parent.glob("*")))
+    if not os.path.exists(file):  # nor may its name be one that no file can have
+        beside = sorted(os.listdir(file.parent)) if os.path.isdir(file.parent) else []
+        hint = did_you_mean(file.name, beside)
         raise _NotThereError(f"cannot find {what} {file.name!r} in {str(file.parent)!r}", hint=hint)
 
 
