@@ -184,7 +184,9 @@ def _find_command(run: Run, environment: Mapping[str, str]) -> None:
 
 def _find_file(what: str, file: Path) -> None:
     if not os.path.exists(file):  # nor may its name be one that no file can have
-        beside = sorted(os.listdir(file.parent)) if os.path.isdir(file.parent) else []
+        beside: list[str] = []
+        with contextlib.suppress(OSError):
+            beside = sorted(os.listdir(file.parent))
         hint = did_you_mean(file.name, beside)
         raise _NotThereError(f"cannot find {what} {file.name!r} in {str(file.parent)!r}", hint=hint)
 
