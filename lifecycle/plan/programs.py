@@ -186,7 +186,7 @@ def _find_file(what: str, file: Path) -> None:
     if not os.path.exists(file):  # nor may its name be one that no file can have
         beside: list[str] = []
         with contextlib.suppress(OSError):
-            beside = sorted(os.listdir(file.parent))
+            beside = sorted(each.name for each in file.parent.iterdir())
         hint = did_you_mean(file.name, beside)
         raise _NotThereError(f"cannot find {what} {file.name!r} in {str(file.parent)!r}", hint=hint)
 
