@@ -48,9 +48,6 @@ def declared(as_: type, by: object) -> dict[str, Any]:
     return {each.name: getattr(by, each.name) for each in msgspec.structs.fields(as_)}
 
 
-MAX_USER_ID = 32767
-"""Fast DDS 2.14 reads ids of endpoints as int16_t."""
-
 GRAPH_TOPIC = "ros_discovery_info"
 """By which rmw maps endpoints to nodes; every participant has a writer and a reader of it."""
 

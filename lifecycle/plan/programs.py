@@ -183,11 +183,11 @@ def _find_command(run: Run, environment: Mapping[str, str]) -> None:
 
 
 def _find_file(what: str, file: Path) -> None:
-    if not os.path.exists(file):  # nor may its name be one that no file can have
-        beside: list[str] = []
-        with contextlib.suppress(OSError):
-            beside = sorted(each.name for each in file.parent.iterdir())
-        hint = did_you_mean(file.name, beside)
+    if not os.path.exists(file):
+        names: list[str] = []
+        with contextlib.suppress(OSError, ValueError):
+            names = sorted(each.name for each in file.parent.iterdir())
+        hint = did_you_mean(file.name, names)
         raise _NotThereError(f"cannot find {what} {file.name!r} in {str(file.parent)!r}", hint=hint)
 
 
