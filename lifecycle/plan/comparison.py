@@ -435,7 +435,7 @@ def _as_run(node: PlannedNode) -> object:
         ),
         participants=tuple(replace(each, reason="") for each in node.participants),
         parameters=(),
-        mode_parameters=(),
+        mode_parameters={},
         parameter_files=(),
         expected_parameters=(),
         unread_parameter_files=(),
