@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     SIM_TIME,
     Authority,
@@ -429,41 +429,17 @@ def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) ->
 
 
 class PlanError(LifecycleError):
-    """A valid manifest that cannot be planned here: no such executable, processes that disagree.
+    """A valid manifest that cannot be planned here: no such executable, not enough ports.
 
     Attributes:
         at: the declaration that cannot be planned; None when no single one is to blame.
-        diagnostics: everything that is wrong, one by one; empty where the message is complete.
     """
 
     exit_code = ExitCode.MANIFEST_INVALID
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        hint: str = "",
-        at: Position | None = None,
-        diagnostics: tuple[Diagnostic, ...] = (),
-    ) -> None:
+    def __init__(self, message: str, *, hint: str = "", at: Position | None = None) -> None:
         super().__init__(message, hint=hint)
         self.at = at
-        self.diagnostics = diagnostics
-
-    @classmethod
-    def of(cls, diagnostics: tuple[Diagnostic, ...]) -> PlanError:
-        """Return the error that reports all of these, at least one, at the place of the first."""
-        first = diagnostics[0]
-        rest = [
-            f"{each.message}; {each.hint}" if each.hint else each.message
-            for each in diagnostics[1:]
-        ]
-        return cls(
-            "\n".join((first.message, *rest)),
-            hint=first.hint,
-            at=first.at,
-            diagnostics=diagnostics,
-        )
 
     def __str__(self) -> str:
         place = f"{self.at.spelled}: " if self.at else ""
