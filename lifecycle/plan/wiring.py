@@ -18,7 +18,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
 from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -53,7 +53,6 @@ from lifecycle.plan.model import (
     GRAPH_TYPE,
     ParticipantConnections,
     Plan,
-    PlanError,
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
@@ -196,7 +195,8 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     """Connect everything, beside declared connections and the extra participants of flows.
 
     Raises:
-        PlanError: a pair cannot be connected, or there are not enough ports.
+        ManifestError: pairs cannot be connected.
+        PlanError: there are not enough ports.
     """
     discovery, data_layer = plan.discovery, plan.data_layer
     hosts = Hosts.of(plan)
@@ -232,7 +232,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     if static:
         graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
         if found := tuple(_unconnectable(graph, plan, links)):
-            raise PlanError.of(found)
+            raise ManifestError(found)
         plan = with_graph(plan, graph)
     may_use_tcp = not static and _may_use_tcp(plan)
     observers = connect_observers(plan, hosts, own, may_use_tcp=may_use_tcp)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.model import (
     Discovery,
     DiscoveryMode,
@@ -16,7 +17,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan, check_plan
-from lifecycle.plan.model import PlanError
 from tests.builders import manifest, need, node, planned, publisher, subscription
 
 TRIGGER = "std_srvs/srv/Trigger"
@@ -50,7 +50,7 @@ def test_every_pair_that_cannot_be_connected_is_said_at_its_publisher():
         for line, topic in ((12, "audio"), (11, "video"))
     ]
     assert said(system) == lines
-    with pytest.raises(PlanError) as raised:
+    with pytest.raises(ManifestError) as raised:
         build_plan(system, environment={})
     assert [str(each) for each in raised.value.diagnostics] == lines
 
