@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import os
@@ -21,6 +22,7 @@ from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
+from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
@@ -268,7 +270,7 @@ def apply(
 
     programmer = _open(plan, options, treatment)
     try:
-        changes = programmer.diff(flows) if dry_run else programmer.update(flows)
+        changes = asyncio.run(programmer.diff(flows) if dry_run else programmer.update(flows))
     except PartlyError as error:
         if error.done:
             path = shlex.quote(plan.manifest_path)
@@ -282,7 +284,10 @@ def apply(
 
 def remove(plan: Plan) -> int:
     """Remove everything of the system from every network that it was applied to."""
-    changes = _open(plan, ()).close()
+    from lifecycle.programming.programmer import remove_programmed
+
+    directory = runtime_root(os.environ) / run_name(plan, "")
+    changes = asyncio.run(remove_programmed(directory))
     for each in changes:
         click.echo(each.render(done=True))
     if not changes:
