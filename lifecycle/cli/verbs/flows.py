@@ -100,14 +100,6 @@ def command() -> None:
     metavar="FILE",
     help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
 )
-@click.option(
-    "--for",
-    "for_s",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End --record after so long.",
-)
-@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @common.network_options(
     "--export",
@@ -122,16 +114,12 @@ def _show(
     format_: str,
     watch: bool,
     record: Path | None,
-    for_s: float | None,
-    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
     from lifecycle.supervisor.run import looking
 
-    if record is None and (force or for_s is not None):
-        raise UsageError("cannot use --for or --force without --record FILE")
     if record is not None and (watch or export_ is not None):
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
     if watch and export_ is not None:
@@ -146,7 +134,7 @@ def _show(
         )
     plan = _plan_of(target, assignments)
     if record is not None:
-        return _record(plan, Record(record, replaces=force), for_s)
+        return _record(plan, Record(record))
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
@@ -199,34 +187,27 @@ _EACH_S = 1.0
 """What is measured changes so often."""
 
 
-def _record(plan: Plan, record: Record, for_s: float | None) -> int:
-    """Write what is measured each second, until it is over or the supervisor ends."""
+def _record(plan: Plan, record: Record) -> int:
+    """Write what is measured each second, until it is interrupted or the supervisor ends."""
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
     with contextlib.closing(record):
         try:
             if path is not None:
-                _record_supervised(path, record, for_s)
+                _record_supervised(path, record)
             else:
-                follow_running(
-                    plan,
-                    lambda seen: record.add(seen.verdict.measured),
-                    each_s=_EACH_S,
-                    for_s=for_s,
-                )
+                follow_running(plan, lambda seen: record.add(seen.verdict.measured), each_s=_EACH_S)
         finally:
             common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
     return ExitCode.OK
 
 
-def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
+def _record_supervised(path: Path, record: Record) -> None:
     from lifecycle.supervisor.control.protocol import status
 
     began_s = time.monotonic()
     for number in itertools.count():
-        if for_s is not None and number * _EACH_S >= for_s:
-            return
         time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
         try:
             measured = status(path).measured

@@ -136,11 +136,7 @@ def with_supervisors_numbers(seen: JudgedSystem) -> JudgedSystem:
 
 
 def follow_running(
-    plan: Plan,
-    on_change: Callable[[JudgedSystem], None],
-    *,
-    each_s: float | None = None,
-    for_s: float | None = None,
+    plan: Plan, on_change: Callable[[JudgedSystem], None], *, each_s: float | None = None
 ) -> None:
     """Judge what runs whenever it changes, and give it to `on_change`, until interrupted.
 
@@ -150,14 +146,12 @@ def follow_running(
         plan: what should run.
         on_change: takes what was seen.
         each_s: seconds, > 0, after which what is measured is a change; None if it never is.
-        for_s: seconds, > 0, after which to end; None follows for ever.
     """
 
     async def follow(participant: ObserverParticipant) -> None:
         grace_period = GracePeriod()
         last: JudgedSystem | None = None
         clock = asyncio.get_running_loop().time
-        until_s = clock() + (float("inf") if for_s is None else for_s)
         pause_s = _ASK_AGAIN_S
         while True:
             seen = _judged(plan, await participant.graph.observe(plan), participant)
@@ -171,13 +165,10 @@ def follow_running(
                 on_change(seen)
             if is_other or again_s is not None:
                 pause_s = _ASK_AGAIN_S
-            left_s = until_s - clock()
-            if left_s <= 0:
-                return
             if each_s is not None and measures:
-                await asyncio.sleep(min(each_s, left_s))
+                await asyncio.sleep(each_s)
             else:
-                changed = await _change(participant, min(pause_s, left_s))
+                changed = await _change(participant, pause_s)
                 pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
 
     asyncio.run(_with_participant(plan, follow))
