@@ -177,7 +177,7 @@ class Connections:
         if participant is not None:
             participant.destroy()
 
-    def close_unused(self, used: Collection[Connection | None]) -> None:
+    def close_unused(self, used: Collection[Connection]) -> None:
         """Unmake participants of single flows that carry nothing any more."""
         for each in tuple(self._made.values()):
             if not each.name and each not in used:

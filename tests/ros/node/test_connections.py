@@ -23,7 +23,7 @@ from lifecycle.graph.state import EventKind, GraphEvent
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.node import endpoint
+from lifecycle.node import data_layer
 from lifecycle.node.connections import ConnectError, UnknownConnectionError
 from lifecycle.node.data_layer import NotConfiguredError
 from lifecycle.node.endpoint import UnknownEndpointError
@@ -52,7 +52,7 @@ class Everything(Hearing):
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is handed over has no peers that could end its patience."""
-    monkeypatch.setattr(endpoint, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(data_layer, "PATIENCE_S", 0.1)
 
 
 def configuration(driver: Driver) -> NodeConfiguration:
@@ -592,14 +592,3 @@ def test_a_name_that_cannot_be_is_refused(active: Active) -> None:
         "not contain characters other than alphanumerics, '_', '~', '{', or '}'"
     )
     assert node.mappings == (("publishers/out", ""),)
-
-
-def test_a_remap_that_a_rule_of_the_plan_would_undo_is_refused(active: Active) -> None:
-    node = active(Talking, publisher("out"), remap=(("chatter", "/there"),))
-    with pytest.raises(Exception, match="cannot ") as error:
-        node.remap("out", "/chatter")
-    assert str(error.value) == (
-        "cannot call publisher 'out' '/chatter': a remapping rule that the node was started with "
-        "makes it '/there'; take the rule out of the manifest's `remap:`, or choose another name"
-    )
-    assert node.publisher("out").entity.topic_name == "/out"
