@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from lifecycle.node.gate import DeclaredPublisher
     from lifecycle.node.managed import Managed
-    from lifecycle.node.services import Turns
 
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
@@ -239,53 +238,20 @@ def interface_name(interface: type[Any]) -> str:
     return f"{package}/{kind}/{interface.__name__}"
 
 
-SETTLE_S = 0.25
-"""The old one lives on after the new one has matched as many peers as it had."""
-
-PATIENCE_S = 4.0
-"""Both live at most so long, if the new one never matches as many.
-
-A participant that others have not noticed at once is announced again after 3 s.
-"""
-
-
-class Handover:
+class Handover(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The time in which an endpoint is on two connections: make before break.
 
-    Both ends of a flow learn of each other at different moments, so a match seen here does not
-    prove that the other side has seen it: the old one stays a little longer than that. Meanwhile a
-    publisher publishes by the old one, and a subscription receives by both.
+    Meanwhile a publisher publishes by the old one, and a subscription receives by both.
 
     Attributes:
-        old: where it is until then.
+        old: where it is until then; None if it was nowhere.
+        peers: how many the new one has to match.
         done: the old one is destroyed.
     """
 
-    def __init__(
-        self, old: Placement, peers_before: int, turns: Turns, finish: Callable[[], None]
-    ) -> None:
-        self.old = old
-        self.done: Future = Future()
-        self._peers_before = peers_before
-        self._turns = turns
-        self._finish = finish
-        self._settles = False
-        self._call_off = turns.call_after(PATIENCE_S, self.end)
-
-    def peers_changed(self, peers: int) -> None:
-        """The new one has so many peers now."""
-        if peers >= self._peers_before and not self._settles and not self.done.done():
-            self._settles = True
-            self._call_off()
-            self._call_off = self._turns.call_after(SETTLE_S, self.end)
-
-    def end(self) -> None:
-        """Break now; again is harmless."""
-        if self.done.done():
-            return
-        self._call_off()
-        self.done.set_result(None)
-        self._finish()
+    old: Placement | None
+    peers: int
+    done: Future = msgspec.field(default_factory=Future)
 
 
 _DESTROY = {
@@ -304,14 +270,6 @@ def make_entity(managed: Managed, endpoint: Endpoint, connection: Connection) ->
     if introspection is not None:
         entity.configure_introspection(
             managed.node.get_clock(), qos_profile_system_default, introspection
-        )
-    made = wire_name(entity)
-    if endpoint.given_name and made and made != endpoint.given_name:
-        unmake(managed, kind, entity, connection)
-        raise LifecycleError(
-            f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
-            f"rule that the node was started with makes it {made!r}",
-            hint="take the rule out of the manifest's `remap:`, or choose another name",
         )
     return entity
 
