@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import ExitCode, UsageError
@@ -123,6 +124,8 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: Order) -> Answer:
+        if question.plan is not None:
+            question = replace(question, plan=self._session.system.attached(question.plan))
         if question.ask is ControlRequest.STATUS:
             differs: tuple[str, ...] = ()
             if (plan := question.plan) is not None:
@@ -289,12 +292,6 @@ def _check_apply(plan: Plan, system: System) -> None:
         raise _refused_whole(
             what, "a TCP port that was used is not connected to again by who used it"
         )
-    for key in (*change.restarted, *change.removed):
-        if (name := system.nodes[key].name) in system.run.adopted:
-            raise UsageError(
-                f"{what}: {name!r} would be taken down, and was adopted",
-                hint="who started it ends it; then lifecycle down, and lifecycle up",
-            )
 
 
 def _is_whole(plan: Plan) -> bool:

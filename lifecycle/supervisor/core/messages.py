@@ -12,7 +12,6 @@ import msgspec
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, Readiness
 from lifecycle.plan.comparison import GivenParameters
-from lifecycle.plan.model import Plan
 from lifecycle.supervisor.core.state import Level, Order, Step
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
@@ -182,13 +181,6 @@ class Silent(msgspec.Struct, frozen=True, kw_only=True):
     hangs: bool = False
 
 
-class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """It is known what of the system runs already: `plan` attaches to it, `nodes` by full name."""
-
-    plan: Plan
-    nodes: frozenset[str]
-
-
 class Refused(msgspec.Struct, frozen=True, kw_only=True):
     """Something was found, beside all looks, that closes the gate for good."""
 
@@ -209,7 +201,7 @@ class Broken(msgspec.Struct, frozen=True, kw_only=True):
 
 Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
-    | Ordered | Stop | Silent | Adopted | Refused | Broken
+    | Ordered | Stop | Silent | Refused | Broken
 )  # fmt: skip
 
 

@@ -33,7 +33,6 @@ from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import STARTS, refused_at_once
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.nodes.driver import adopt
 from lifecycle.supervisor.nodes.liveliness import Answering, Cause
 from lifecycle.supervisor.nodes.peers import FAILED, Peers
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -410,10 +409,6 @@ class Supervisor:
             error = failed.message
         self.give(messages.Programmed(number=effect.number, error=error))
 
-    async def _adopt(self) -> None:
-        """Take what runs already as it is found, before anything is started."""
-        self.give(await adopt(self.system, self.means.participant))
-
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
         text = f"cannot go on: {text}"
@@ -454,8 +449,6 @@ class Supervisor:
             each.add_done_callback(self._done)
         try:
             with self._signals():
-                if self.system.run.adopting:
-                    self.start(self._adopt())
                 self.give(messages.Tick())
                 try:
                     await self._over.wait()
