@@ -137,7 +137,7 @@ def _node_profile(node: PlannedNode) -> Profile:
         (EndpointKind.SUBSCRIPTION, "/clock"),
     }
     if node.managed:
-        allowed |= {(EndpointKind.PUBLISHER, each) for each in _node_topics(node)}
+        allowed.add((EndpointKind.PUBLISHER, f"{node.full_name}/transition_event"))
         allowed |= {
             (EndpointKind.PUBLISHER, GRAPH_TOPIC),
             (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
@@ -161,7 +161,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
             names -= MANAGED_SERVICES
         allowed |= {(EndpointKind.SERVICE_CLIENT, f"{node.full_name}/{name}") for name in names}
         if node.managed:
-            allowed |= {(EndpointKind.SUBSCRIPTION, each) for each in _node_topics(node)}
+            allowed.add((EndpointKind.SUBSCRIPTION, f"{node.full_name}/transition_event"))
     for other in plan.machines:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
         allowed.add((kind, supervisor_alive_topic(plan.system, other.name)))
@@ -170,10 +170,6 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(plan, machine if several else "")
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
-
-
-def _node_topics(node: PlannedNode) -> tuple[str, ...]:
-    return tuple(f"{node.full_name}/{name}" for name in ("transition_event", "_alive"))
 
 
 def _chosen(process: PlannedProcess) -> str:

@@ -51,7 +51,7 @@ class ObserverParticipant:
         unknown_versions: which installed libraries are not known, and what that costs; empty if
             all are.
         announce_alive: asserts by DDS liveliness that we live.
-        watch_alive: watches the liveliness of another supervisor, or of a node that is attached.
+        watch_alive: watches the liveliness of another supervisor.
         plan_notices: takes part in the exchange of plans.
         republish_names: announces our node to the graph again.
         send_again_soon: has what waits for a link to come back be sent soon when it does.

@@ -369,7 +369,6 @@ class Supervisor:
         if self.authority is not None:
             self.authority.replan(run.plan, again)
         self.means.networks.replan(run.plan)
-        self.peers.renew()
         if run.first is not first:
             self.peers.announce()
 
