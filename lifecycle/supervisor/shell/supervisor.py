@@ -38,9 +38,7 @@ from lifecycle.supervisor.nodes.peers import FAILED, Peers
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.fork_server import reap_adopted
 from lifecycle.supervisor.run.events import (
-    Event,
     Failure,
-    LogLine,
     Notice,
     ProcessChanged,
     Stopped,
@@ -225,8 +223,6 @@ class Supervisor:
         self._say_states()
         for event in events:
             self._emit(event)
-        if isinstance(given, messages.Verified) and given.verdict.measured:
-            self._server.changed()  # other numbers alone are no event
         self._requests.drop()
         wanted = advance.advance(run)
         self._say_states()
@@ -426,12 +422,7 @@ class Supervisor:
         await self._server.open()
         self.peers.open()
 
-        def changed(event: Event) -> None:
-            if not isinstance(event, LogLine):
-                self._server.changed()
-                self._ros_interface.on_event(event)
-
-        self._emit.listen(changed)
+        self._emit.listen(self._ros_interface.on_event)
         self.start(self._ros_interface.follow())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [

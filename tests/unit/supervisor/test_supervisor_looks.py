@@ -18,8 +18,8 @@ from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.peers import Peers
 from lifecycle.supervisor.shell import looks as shell_looks
-from lifecycle.supervisor.shell.looks import DISCOVERED_S, HEALTH_S, Looks, without
-from lifecycle.supervisor.shell.settling import PASSING_S
+from lifecycle.supervisor.shell.looks import HEALTH_S, Looks, without
+from lifecycle.supervisor.shell.settling import DISCOVERED_S, PASSING_S
 from lifecycle.verify.observation import (
     HealthReport,
     NodeParameters,
