@@ -68,7 +68,7 @@ class Exited(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Swept(msgspec.Struct, frozen=True, kw_only=True):
-    """Nothing is left of a process that ended: what it started has ended, the graph forgot it.
+    """Nothing is left of a process that ended: what it started has ended, too.
 
     Attributes:
         reported: by node of others, the URLs of each of its connections, as it reports them.
@@ -222,7 +222,7 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sweep(msgspec.Struct, frozen=True, kw_only=True):
-    """End what a process left, and wait until the graph has forgotten its nodes; `Swept`."""
+    """End what a process left; `Swept`."""
 
     process: str
 

@@ -362,13 +362,6 @@ class System:
                 found[node.name] = process.end.text
         return found
 
-    def dead(self) -> frozenset[str]:
-        """Return the names of the nodes whose process has ended.
-
-        Discovery shows them until their lease runs out.
-        """
-        return frozenset(node.name for node in self.nodes.values() if node.is_gone)
-
     def _is_there(self, name: str) -> bool:
         """Whether a node has started, and is in the graph as far as that is known."""
         node = self._by_name.get(name)

@@ -193,8 +193,7 @@ class Looks:
         system = self._system
         await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
         awake = {each.full_name for each in system.plan.nodes} - system.liveliness.silent.keys()
-        seen = await self._graph.observe(system.plan, only=awake, machines=system.machines)
-        observation = without(seen, system.dead())
+        observation = await self._graph.observe(system.plan, only=awake, machines=system.machines)
         run = system.run
         is_measured = run.held_s is not None and run.passage is None
         if is_measured:
@@ -316,7 +315,6 @@ class Looks:
         `began`: the processes when the look began: of one that has died since it shows nothing.
         """
         nodes, awaited = self._system.nodes, self._system.plan.awaited
-        seen = without(seen, self._system.dead())
         states = {each.full_name: each.state for each in seen.nodes}
         own = {each.name: own_health(each) for each in seen.configurations}
         published = {each.full_name: each.health for each in seen.nodes}
@@ -356,27 +354,6 @@ class Looks:
             self._activated_s[key] = now_s
             asyncio.get_running_loop().call_later(SHOWN_S, self._system.touch)
         return is_news
-
-
-def without(observation: Observation, dead: frozenset[str]) -> Observation:
-    """Return `observation` without the ghosts of dead nodes; a second node of the name stays."""
-    if not dead:
-        return observation
-    alive = {
-        node.full_name for node in observation.nodes if node.full_name in dead and node.count > 1
-    }
-    gone = dead - alive
-    return replace(
-        observation,
-        nodes=tuple(
-            replace(node, count=node.count - 1) if node.full_name in alive else node
-            for node in observation.nodes
-            if node.full_name not in gone
-        ),
-        endpoints=tuple(each for each in observation.endpoints if each.node not in gone),
-        configurations=tuple(each for each in observation.configurations if each.name not in gone),
-        parameters=tuple(each for each in observation.parameters if each.node not in gone),
-    )
 
 
 def own_health(report: NodeConfiguration | None) -> HealthReport | None:

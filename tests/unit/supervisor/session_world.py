@@ -228,7 +228,12 @@ class FakeParticipant(FakeAir):
         del machines
         self.looks += 1
         self.asked = [each.key for each in plan.nodes if only is None or each.full_name in only]
-        hosted = [name for names in self._hosts.nodes.values() for name in names]
+        hosted = [
+            name
+            for process, names in self._hosts.nodes.items()
+            if self._hosts.processes[process].pid not in self.forgotten
+            for name in names
+        ]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(
             nodes=tuple(
