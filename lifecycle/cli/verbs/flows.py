@@ -165,7 +165,7 @@ def _measuring(plan: Plan) -> Path | None:
 
 
 def _watch(plan: Plan, format_: str) -> int:
-    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
@@ -176,7 +176,7 @@ def _watch(plan: Plan, format_: str) -> int:
             )
             return ExitCode.OK
         with common.asking(path):
-            for seen in follow(path / "control"):
+            for seen in follow(path):
                 if seen.verdict is not None:
                     show(watched_flows(seen.verdict, format_))
     common.say(f"{path.name}: its supervisor has ended")
