@@ -18,7 +18,14 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error, warning
+from lifecycle.manifest.diagnostics import (
+    Diagnostic,
+    ManifestError,
+    Position,
+    Severity,
+    error,
+    warning,
+)
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
@@ -58,8 +65,8 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters
-from lifecycle.plan.processes import planned_processes
-from lifecycle.plan.wiring import place, wire
+from lifecycle.plan.processes import overcrowded, planned_processes
+from lifecycle.plan.wiring import own_transports, place, wire
 from lifecycle.printable import listed
 
 
@@ -242,14 +249,14 @@ def check_plan(
     variables = os.environ if environment is None else environment
     parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
     try:
-        _wired(manifest, variables, parameters)
+        plan = _wired(manifest, variables, parameters)
     except UsageError:
         return ()  # the environment's fault, reported where it is used
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
         alone = error("plan.impossible", at, problem.message, problem.hint)
         return problem.diagnostics or (alone,)
-    return tuple(_without_clock(manifest, parameters))
+    return (*overcrowded(plan, variables), *_without_clock(manifest, parameters))
 
 
 def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[Diagnostic]:
@@ -298,7 +305,11 @@ def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodePar
         levels=dependency_levels(manifest.nodes),
         rmw=variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW,
     )
-    return wire(plan, manifest.links)
+    plan = wire(plan, manifest.links)
+    crowded = overcrowded(plan, variables)
+    if refused := tuple(each for each in crowded if each.severity is Severity.ERROR):
+        raise PlanError.of(refused)
+    return plan
 
 
 def effective_domain(discovery: Discovery, environment: Mapping[str, str]) -> int:
@@ -358,10 +369,7 @@ def _planned_node(
         _planned_endpoint(node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), hash_of)
         for endpoint in node.interface.endpoints
     )
-    # Only a node in our own host can be given more participants; what others start keeps its own.
-    ours = node.run.kind is RunKind.PYTHON
-    groups = needs.groups(node) if ours else ()
-    endpoints, participants = place(node.name, endpoints, node.connections, groups)
+    endpoints, participants = place(node, endpoints, needs)
     expected = parameters.expected(node)
     given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
@@ -380,7 +388,7 @@ def _planned_node(
         unread_parameter_files=parameters.unread(node),
         participants=participants,
         endpoint_policy=node.endpoints,
-        transports=needs.node_transports(node) if ours else (),
+        transports=own_transports(node, needs) if node.run.kind is RunKind.PYTHON else (),
         files=tuple(
             _planned_file(node.parameter_files, place, text, digest_of)
             for place, text in node.written_paths

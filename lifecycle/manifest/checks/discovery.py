@@ -11,16 +11,14 @@ from collections.abc import Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.diagnostics import Diagnostic, error, note, warning
 from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
     Authority,
     DataLayerSource,
     DiscoveryMode,
     DiscoveryRange,
-    EndpointKind,
     FlowTransport,
-    Machine,
     Node,
     RunKind,
 )
@@ -34,17 +32,6 @@ from lifecycle.network.medium import (
     max_unfragmented,
 )
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.network.ports import (
-    LINUX,
-    LOCALHOST_PARTICIPANTS,
-    LOCALHOST_PEERS_RANGE,
-    EphemeralRange,
-    describe_domains,
-    domain_of,
-    max_participants,
-    overflows,
-    safe_domains,
-)
 
 _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 """RMWs that are known to give no endpoint a network flow or a DSCP of its own."""
@@ -354,135 +341,6 @@ def _has_ipv6(environment: Mapping[str, str]) -> bool:
     )
 
 
-_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
-"""Asks for the limits that hold whatever an operating system does with its ports."""
-
-
-def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the domain, and about room for all participants.
-
-    ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE hold where the manifest leaves them open.
-    """
-    domain = system.manifest.discovery.domain_id
-    if domain is None:
-        # One that is no domain is the environment's fault, and refused where it is used.
-        domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
-    start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
-    section = system.manifest.positions.get("discovery")
-    try:
-        room = max_participants(domain, LINUX).participants
-    except ValueError as problem:  # of a manifest that was made by code
-        message, _, hint = str(problem).partition("; ")
-        yield error("check.domain", section or start, message, hint)
-        return
-    if room == 0:
-        message = (
-            f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
-            f"by default"
-        )
-        hint = f"use domain {describe_domains(safe_domains(LINUX))}"
-        yield note("check.domain", section or start, message, hint)
-    for host in system.hosts.values():
-        at = section or host[0].at
-        refused = [*_crowded(system, host, domain, _NO_EPHEMERAL)]
-        yield from (error("check.ports", at, *each) for each in refused)
-        if room and not refused:
-            crowded = _crowded(system, host, domain, LINUX)
-            yield from (note("check.ports", at, *each) for each in crowded)
-        yield from _beyond_localhost(system, host)
-
-
-def _crowded(
-    system: DeclaredSystem, host: list[Machine], domain: int, ephemeral: EphemeralRange
-) -> Iterator[tuple[str, str]]:
-    """Yield message and hint of each kind of port that a host has too few of."""
-    nodes = _nodes_on(system, host)
-    needs = [each for node in nodes for each in system.needs.of_node(node) if each.unique]
-    for each in overflows(
-        domain,
-        participants=_participants(nodes, system),
-        unique_subscriptions=sum(each.need.kind is EndpointKind.SUBSCRIPTION for each in needs),
-        host=_spell_host(nodes),
-        ephemeral=ephemeral,
-    ):
-        message, _, hint = each.partition("; ")
-        yield message, hint
-
-
-def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:
-    names = {machine.name for machine in host}
-    return [node for node in system.manifest.nodes if node.machine in names]
-
-
-def _spell_host(nodes: list[Node]) -> str:
-    used = dict.fromkeys(node.machine for node in nodes)
-    return f"machine{'s' * (len(used) > 1)} {', '.join(map(repr, used))}"
-
-
-_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-
-_BY_OTHER_MEANS = (*_PROFILES, "ROS_DISCOVERY_SERVER")
-"""Variables by which a process may find others in another way than by the range."""
-
-
-def _beyond_localhost(system: DeclaredSystem, host: list[Machine]) -> Iterator[Diagnostic]:
-    """Yield a finding where participants of a host could not all find each other on localhost.
-
-    Counted is what certainly looks for others in the way of rmw_fastrtps: the supervisor's
-    participant, and those of processes that it starts.
-    """
-    discovery = system.manifest.discovery
-    said, is_local = "'range: localhost'", discovery.range is DiscoveryRange.LOCALHOST
-    if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
-        said = f"{_RANGE}={system.environment.get(_RANGE, '')}"
-        is_local = said.endswith(f"={DiscoveryRange.LOCALHOST.name}")
-    if (
-        not is_local
-        or discovery.mode is not DiscoveryMode.DYNAMIC
-        or not discovery.transport.by_udp
-        or any(system.environment.get(name) for name in _BY_OTHER_MEANS)
-    ):
-        return
-    otherwise = {_RANGE, "ROS_DOMAIN_ID", *_BY_OTHER_MEANS}
-    nodes = [
-        node
-        for node in _nodes_on(system, host)
-        if node.run.kind is not RunKind.ATTACH
-        and system.rmw_of(node).startswith("rmw_fastrtps")
-        and otherwise.isdisjoint(dict(node.run.environment))
-    ]
-    participants = _participants(nodes, system)
-    if participants <= LOCALHOST_PARTICIPANTS:
-        return
-    message = (
-        f"cannot run {participants} participants with {said} on {_spell_host(nodes)}: at most "
-        f"{LOCALHOST_PARTICIPANTS} all find each other, because each looks for participants 0 to "
-        f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
-    )
-    hint = "use 'range: subnet', or give several nodes one 'process:'"
-    at = system.manifest.positions.get("discovery", nodes[0].at)
-    yield error("check.localhost", at, message, hint)
-
-
-def _participants(nodes: list[Node], system: DeclaredSystem) -> int:
-    """Count DDS participants as the planner makes them.
-
-    The supervisor's, one for each process and each choice of transports in it, and one more for
-    each group of publishers that need their own.
-    """
-    needs = system.needs
-    shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
-    count = 1 + len(shared)
-    for node in nodes:
-        if node.run.kind is RunKind.PYTHON:
-            on_connections = {entry for each in node.connections for entry in each.map}
-            count += sum(
-                any((group.kind, name) not in on_connections for name in group.names)
-                for group in needs.groups(node)
-            )
-    return count
-
-
 CHECKS = (
     check_range,
     check_addresses,
@@ -492,6 +350,5 @@ CHECKS = (
     check_authority,
     check_transport,
     check_ipv6,
-    check_ports,
 )
 OF_A_NODE = (check_participant, check_middleware, check_fragments)
