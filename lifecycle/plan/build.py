@@ -73,14 +73,24 @@ from lifecycle.printable import listed
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     """Layer nodes so that each is one level below the last node it waits for.
 
-    Nodes of one level keep the manifest's order and do not wait for each other. That there is no
-    cycle is checked before (`check.after-cycle`).
+    Nodes of one level keep the manifest's order and do not wait for each other.
+
+    Raises:
+        PlanError: nodes wait for each other.
     """
     order = {node.key: index for index, node in enumerate(nodes)}
     sorter = graphlib.TopologicalSorter(
         {node.key: [each.node for each in node.after] for node in nodes}
     )
-    sorter.prepare()
+    try:
+        sorter.prepare()
+    except graphlib.CycleError as problem:
+        circle = problem.args[1][::-1]  # each waits for the one after it
+        after = nodes[order[circle[0]]].after
+        at = next(each.at for each in after if each.node == circle[1])
+        message = f"cannot order nodes that wait for each other: {' → '.join(circle)}"
+        found = error("check.after-cycle", at, message, "remove one of these 'after'")
+        raise PlanError.of((found,)) from problem
     levels = []
     while ready := sorter.get_ready():
         levels.append(tuple(sorted(ready, key=order.__getitem__)))
