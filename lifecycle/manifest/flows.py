@@ -138,29 +138,14 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         return self.flow_class.five_qi
 
     @property
+    def non_blocking_send(self) -> bool:
+        """What finds the socket's buffer full is lost."""
+        return self.need.non_blocking_send
+
+    @property
     def prioritised(self) -> bool:
         """Whether a network is to treat this flow differently from others."""
         return self.unique or self.dscp is not None or self.five_qi is not None
-
-
-class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
-    """Endpoints of one kind and node that share an extra participant.
-
-    Attributes:
-        kind: PUBLISHER, or SUBSCRIPTION: then what they acknowledge with carries the DSCP.
-        names: declared, in the interface's order.
-        unique: it carries one publisher that needs an NFE of its own.
-        five_qi: the class by which a network distinguishes it; None if it need not.
-    """
-
-    kind: EndpointKind
-    names: tuple[str, ...]
-    unique: bool
-    dscp: int | None
-    five_qi: int | None
-    transports: tuple[Medium, ...]
-    max_datagram_bytes: int | None
-    non_blocking_send: bool
 
 
 class FlowNeeds:
@@ -189,53 +174,6 @@ class FlowNeeds:
         """Return all needs of a node, in the order of the manifest."""
         for need in node.flows:
             yield self._resolved[node.key, need.kind, need.name]
-
-    def node_transports(self, node: Node) -> tuple[Medium, ...]:
-        """Return all that a node's own participant may use, and its subscriptions receive by.
-
-        Empty for any.
-        """
-        for each in self.of_node(node):
-            if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:
-                continue  # a marked one receives on a participant beside it
-            if each.transports:
-                return each.transports
-        return ()
-
-    def groups(self, node: Node) -> tuple[ParticipantGroup, ...]:
-        """Return the extra participants that a node's endpoints need: as few as meet every need.
-
-        A publisher that needs an NFE of its own shares with none. Others share if they ask for the
-        same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
-        acknowledgements leave by the sockets of the participant; they never share with publishers,
-        whose flow a network that looks at marks must not take theirs for. Within one node only: a
-        participant belongs to a node, whose hidden node is what the graph shows.
-        """
-        found: dict[object, ParticipantGroup] = {}
-        own = (None, None, self.node_transports(node), False)
-        for endpoint in node.interface.endpoints:
-            each = self.of(node.key, endpoint.kind, endpoint.name)
-            if each is None or not endpoint.kind.is_topic:
-                continue
-            unique = each.unique and endpoint.kind is EndpointKind.PUBLISHER
-            five_qi, transports = None if each.unique else each.five_qi, each.transports or own[2]
-            class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
-            if not unique and class_ == own and each.max_datagram_bytes is None:
-                continue
-            key = endpoint.name if unique else (endpoint.kind, class_)
-            known = found.get(key)
-            sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
-            found[key] = ParticipantGroup(
-                kind=endpoint.kind,
-                names=(*(known.names if known else ()), endpoint.name),
-                unique=unique,
-                dscp=each.dscp,
-                five_qi=five_qi,
-                transports=transports,
-                max_datagram_bytes=min((size for size in sizes if size is not None), default=None),
-                non_blocking_send=each.need.non_blocking_send,
-            )
-        return tuple(found.values())
 
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
         topic = topic_of(node, need.name, need.kind)

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
-from lifecycle.manifest.diagnostics import Diagnostic, error, note, warning
-from lifecycle.manifest.flows import ResolvedNeed
+from lifecycle.manifest.diagnostics import Diagnostic, error, note
 from lifecycle.manifest.model import (
     QUANTILE,
     EndpointKind,
@@ -15,7 +14,6 @@ from lifecycle.manifest.model import (
     Link,
     Node,
     Quantity,
-    RunKind,
     UniqueHow,
 )
 from lifecycle.manifest.names import full_name_problem
@@ -64,8 +62,6 @@ def check_flows(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
             make = error if issue.field in _KEPT_BY_CLASS else note
             hint = "choose another class, or write 'five_qi: auto'"
             yield make("check.five-qi-class", need.at, issue.message, hint)
-        if node.run.kind is not RunKind.PYTHON:
-            yield from _foreign(node, each)
 
 
 def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
@@ -108,28 +104,6 @@ def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
         )
         hint = f"what is left is {describe(mapped.tos >> 2)}"
         yield note("check.transport-priority", need.at, message, hint)
-
-
-def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    """Judge needs of a node that others start: it keeps the one participant that it makes."""
-    need = each.need
-    what = f"{need.kind.noun} {need.name!r} of {node.key!r}"
-    hint = "write it as 'run: {python: module:Class}'"
-    if need.unique is UniqueRequirement.STRICTLY_REQUIRED and need.kind is EndpointKind.PUBLISHER:
-        message = (
-            f"cannot make {what} strictly unique: no RMW does that for a publisher, and only a "
-            f"node with 'run: python' can be given a participant of its own"
-        )
-        yield error("check.flow-impossible", need.at, message, hint)
-    elif each.unique:
-        message = f"cannot make {what} unique from outside: its own code must ask for it"
-        yield warning("check.flow-foreign", need.at, message, hint)
-    if each.dscp is not None:
-        message = f"cannot mark {what} with a DSCP: only a node with 'run: python' can be marked"
-        yield warning("check.flow-foreign", need.at, message, hint)
-    if need.non_blocking_send:
-        message = f"cannot make {what} send without waiting: its participant is not ours"
-        yield warning("check.flow-blocks", need.at, message, hint)
 
 
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
