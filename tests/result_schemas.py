@@ -110,6 +110,7 @@ RESULTS = {
                 *("timeouts", "log_level"),
             ),
         },
+        edit=lambda schema: schema["$defs"]["Run"]["properties"].pop("attach"),  # it is a kind
     ),
     "status": Result(
         type_=SystemStatus,
@@ -219,7 +220,7 @@ def generate_manifest() -> str:
     for name, type_ in found.items():
         if name not in words:
             defs[name] = _section(type_, defs[name])
-    reaction = {"enum": list(get_args(written.Reaction))}
+    reaction = {"enum": list(get_args(written.Word))}
     for_rules["not"] = {"required": ["mode"]}
     names = [name for each in code_points() for name in (each.name, *each.aliases)]
     special = {

@@ -20,7 +20,6 @@ from msgspec.structs import replace
 
 from lifecycle.codec import Octet
 from lifecycle.errors import did_you_mean, nearest
-from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import (
     Findings,
     ManifestError,
@@ -34,6 +33,7 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     Interface,
+    Parameter,
     ParameterDeclaration,
     ParameterValue,
 )
@@ -139,7 +139,7 @@ _TYPES: Mapping[str, Any] = {
 
 
 def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclaration:
-    declared = read_part(part, written.Parameter)
+    declared = read_part(part, Parameter)
     default: ParameterValue | None = None
     if (value := part.get("default_value")) is not None:
         try:

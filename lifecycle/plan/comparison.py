@@ -178,13 +178,8 @@ def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
     run = node.run
     return {
         **{name: each for name, each in _fields(run, "kind").items() if each},
-        **{name: _plain(getattr(run, name)) for name in _OF_RUN if getattr(run, name)},
         "working_directory": folder.written if folder else run.working_directory or None,
     }
-
-
-_OF_RUN = ("arguments", "environment", "extra_arguments")
-"""Fields of `run` that are pairs of a name and a value."""
 
 
 def _plain(values: Iterable[tuple[str, object]]) -> _Tree:
@@ -198,11 +193,9 @@ def _consequences(said: OnViolation) -> _Tree:
 def _interface(node: PlannedNode) -> _Tree:
     found: dict[str, dict[str, object]] = {"parameters": {}}
     for parameter in node.declared_parameters:
-        declared = _fields(parameter, "name", "description")
-        declared["default_value"] = declared.pop("default")
-        found["parameters"][parameter.name] = declared
+        found["parameters"][parameter.name] = _fields(parameter, "name", "description")
     for each in node.endpoints:
-        declared = {"type": each.type}
+        declared: dict[str, object] = {"type": each.type}
         if each.qos is not None:
             declared["qos"] = _fields(each.qos, *each.qos_defaults)
         found.setdefault(each.kind.value, {})[each.name] = declared

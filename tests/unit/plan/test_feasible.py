@@ -124,7 +124,7 @@ def test_what_is_negotiated_while_the_system_runs_is_not_judged_before():
 
 def test_every_pair_that_cannot_be_connected_is_said_at_its_publisher():
     by = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv6"}
-    foreign = Run(kind=RunKind.COMMAND, command=("viewer",), environment=tuple(by.items()))
+    foreign = Run(kind=RunKind.COMMAND, command=("viewer",), environment=by)
     system = manifest(
         node(
             "camera",
