@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,6 +18,7 @@ import msgspec
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, error
+from lifecycle.manifest.written import MANIFEST, read_schema
 from lifecycle.manifest.yaml.document import (
     YAML_1_1_BOOLEANS,
     Document,
@@ -35,20 +34,7 @@ ValidationError = Any
 _CHOICES = ("anyOf", "oneOf")
 
 
-MANIFEST = "manifest.v1.schema.json"
-"""The file, in schemas/, that defines what a manifest may hold."""
-
 _SUBSTITUTION = {"$ref": "#/$defs/substitution"}
-
-
-@functools.cache
-def read_schema(name: str) -> Mapping[str, Any]:
-    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
-    # Wheels hold a copy of schemas/; a checkout holds a link to it.
-    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
-    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
-    schema: Mapping[str, Any] = json.loads(text)
-    return schema
 
 
 def validate(

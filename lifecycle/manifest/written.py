@@ -7,6 +7,10 @@ Owns: which keys there are, what their values may be, and what editors and messa
 
 from __future__ import annotations
 
+import functools
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
@@ -14,7 +18,6 @@ from msgspec import Meta, Struct, field
 
 from lifecycle.manifest.model import (
     BY_DEFAULT,
-    RULES_AND_FAMILIES,
     WORD,
     Condition,
     Consequence,
@@ -45,6 +48,28 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
+
+MANIFEST = "manifest.v1.schema.json"
+"""The file, in schemas/, that defines what a manifest may hold."""
+
+
+@functools.cache
+def read_schema(name: str) -> Mapping[str, Any]:
+    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
+    # Wheels hold a copy of schemas/; a checkout holds a link to it.
+    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
+    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
+    schema: Mapping[str, Any] = json.loads(text)
+    return schema
+
+
+def _rules() -> Collection[str]:
+    """Return what `on_violation` may name, which the schema lists: ids and families of rules."""
+    keys: Collection[str] = read_schema(MANIFEST)["$defs"]["OnViolation"]["anyOf"][1][
+        "propertyNames"
+    ]["enum"]
+    return keys
+
 
 T = TypeVar("T")
 B = TypeVar("B", bound=Struct)
@@ -85,7 +110,7 @@ RuleOrFamily = Annotated[
     str,
     Meta(
         extra_json_schema={
-            "enum": [*RULES_AND_FAMILIES],
+            "enum": "rules and families",
             "patternErrorMessage": "use 'default', a family of rules as 'flow', or the id of a"
             " rule (docs/rules.md)",
         }
@@ -134,7 +159,7 @@ def read_special(type_: type, value: object) -> object:
         return Dscp(parse_dscp(msgspec.convert(value, int, strict=isinstance(value, bool))))
     by_rule = isinstance(value, dict) and [*value] != ["mode"]
     reactions = msgspec.convert(value if by_rule else {BY_DEFAULT: value}, ForRules)
-    require(reactions.keys() <= {*RULES_AND_FAMILIES})
+    require(reactions.keys() <= {*_rules()})
     return OnViolation(
         tuple(
             Reaction(rule=rule, what=Consequence.MODE, mode=each.mode)
@@ -607,3 +632,9 @@ class Manifest(Shared, frozen=True, kw_only=True):
     on_violation: OnViolation | None = None
     modes: Annotated[dict[Name, Mode], Meta(min_length=1)] | None = None
     links: tuple[LinkKeys, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rule that there is not."""
+        super().__post_init__()
+        if self.policy.trust:
+            require({*self.policy.trust} <= {each for each in _rules() if "." in each})
