@@ -109,9 +109,9 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def dscp(self) -> int | None:
         """The DSCP of its data, of a subscription of what it acknowledges with, 0–63."""
-        if self.need.dscp is not None or self.tos is None or self.tos & ECN_MASK:
-            return self.need.dscp
-        return self.tos >> 2
+        if self.need.dscp is not None:
+            return int(self.need.dscp)
+        return None if self.tos is None or self.tos & ECN_MASK else self.tos >> 2
 
     @property
     def five_qi(self) -> int | None:
