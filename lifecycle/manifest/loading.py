@@ -196,10 +196,6 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     return replace(manifest, nodes=tuple(nodes), links=tuple(links), modes=tuple(modes))
 
 
-SUFFIX = ".lifecycle.yaml"
-"""What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
-
-
 _SECTIONS = ("discovery", "network", "data_layer", "on_violation")
 """Sections of a document that findings may be about."""
 
@@ -279,12 +275,6 @@ class _Loading:
             message = f"cannot use {what} as a manifest"
             self.found.append(error("manifest.kind", document.at(), message, hint))
             return
-        if not document.file.endswith(SUFFIX):
-            at = Position(file=document.file, line=1, column=1)
-            name = Path(document.file).name
-            message = f"cannot tell by its name {name!r} that this is a manifest"
-            stem = name.removesuffix(".yaml").removesuffix(".yml")
-            self.found.append(note("manifest.suffix", at, message, f"rename it to {stem}{SUFFIX}"))
         before = len(self.found)
         surroundings = Surroundings(
             environment=self._environment, folder=folder_of(path), programs=self._programs
@@ -462,22 +452,13 @@ MAX_MANIFESTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-def _identity(path: Path) -> str:
-    """Return a path without links, to recognise a file again."""
-    try:
-        return os.path.realpath(path)
-    except (OSError, ValueError):  # a name that no file can have; opening it reports that
-        return str(path)
-
-
 def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
     """Return the file that an entry of `include:` names; None after reporting why there is none."""
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
-    identities = [_identity(each) for each in chain]
     why, hint = "", ""
-    if (identity := _identity(path)) in identities:
-        round_trip = [*chain[identities.index(identity) :], path]
+    if path in chain:
+        round_trip = [*chain[chain.index(path) :], path]
         why = f"it would include itself, {' → '.join(each.name for each in round_trip)}"
     elif len(chain) == MAX_INCLUDE_DEPTH:
         why = f"at most {MAX_INCLUDE_DEPTH} manifests in a row"

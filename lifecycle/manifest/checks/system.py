@@ -16,7 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
@@ -266,14 +266,6 @@ def check_duplicate_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 )
                 hint = "remove one, or remap one of them"
                 yield error("check.duplicate-endpoint", each.at, message, hint)
-        one, *others = first.values()
-        for each in others if kind.value.endswith("_servers") else ():
-            message = (
-                f"cannot tell which of {len(first)} servers answers {name!r}: {one} offers it as "
-                "well"
-            )
-            hint = "move one of them with 'namespace:' or 'remap:'"
-            yield note("check.several-servers", each.at, message, hint)
 
 
 def check_remaps(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
