@@ -22,7 +22,6 @@ from lifecycle.manifest.building import (
     Shared,
     build_modes,
     build_node,
-    build_on_violation,
     positions_of,
     quantities,
     settle,
@@ -54,7 +53,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.written import build, read_part
+from lifecycle.manifest.written import OnViolation, build, read_part
 from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
@@ -302,6 +301,7 @@ class _Loading:
 
     def _system(self, document: Document, arguments: tuple[tuple[str, str], ...]) -> None:
         """Build what is declared of the whole system: the outermost manifest's holds."""
+        reactions = document.get("on_violation")
         declared = Manifest(
             path=document.file,
             arguments=arguments,
@@ -311,7 +311,7 @@ class _Loading:
             network=read_part(document, Network, ("network",)),
             data_layer=read_part(document, DataLayer, ("data_layer",)),
             policy=read_part(document, Policy, ("policy",)),
-            on_violation=build_on_violation(document),
+            on_violation=read_part(reactions, OnViolation).value if reactions else (),
             modes=build_modes(document, self.found),
             positions={
                 **positions_of(document, _SECTIONS),
@@ -457,9 +457,8 @@ def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path |
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
     why, hint = "", ""
-    if path in chain:
-        round_trip = [*chain[chain.index(path) :], path]
-        why = f"it would include itself, {' → '.join(each.name for each in round_trip)}"
+    if path in map(Path, map(os.path.normpath, chain)):
+        why = "it would include itself"
     elif len(chain) == MAX_INCLUDE_DEPTH:
         why = f"at most {MAX_INCLUDE_DEPTH} manifests in a row"
     elif not os.path.exists(path):

@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-import json
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,6 +17,7 @@ import msgspec
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, error
+from lifecycle.manifest.written import MANIFEST, read_schema
 from lifecycle.manifest.yaml.document import (
     YAML_1_1_BOOLEANS,
     Document,
@@ -35,20 +33,7 @@ ValidationError = Any
 _CHOICES = ("anyOf", "oneOf")
 
 
-MANIFEST = "manifest.v1.schema.json"
-"""The file, in schemas/, that defines what a manifest may hold."""
-
 _SUBSTITUTION = {"$ref": "#/$defs/substitution"}
-
-
-@functools.cache
-def read_schema(name: str) -> Mapping[str, Any]:
-    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
-    # Wheels hold a copy of schemas/; a checkout holds a link to it.
-    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
-    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
-    schema: Mapping[str, Any] = json.loads(text)
-    return schema
 
 
 def validate(
@@ -192,38 +177,31 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
         if key in known:
             continue
         place, message = (*_place(each), key), f"cannot use the unknown key {quote(key)}"
-        meant = _OTHERS.get(key) or did_you_mean(key, known) or _home(key)
+        other = _OTHERS.get(key)
+        hint = f"write '{other}'" if other else did_you_mean(key, known)
         value = each.instance[key]
         if "nodes" in known and isinstance(value, dict) and "run" in value:
-            meant = "a node is indented below 'nodes:'"
-        if not meant:
+            hint = "a node is indented below 'nodes:'"
+        if not hint:
             message = f"{message}; allowed: {', '.join(known)}"
-        yield place, error("manifest.unknown-key", document.key_at(place), message, meant)
+        yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
 
 
 _OTHERS = {
-    "latched": "write 'durability: TRANSIENT_LOCAL'",
-    "queue_size": "write 'depth'",
-    "pkg": "write 'run: {package: …}'",
-    "exec": "write 'run: {executable: …}'",
-    "plugin": "write 'run: {component: …}'",
-    "args": "write 'run: {command: …}'",
-    "cwd": "write 'run: {working_directory: …}'",
-    "env": "write 'run: {environment: …}'",
-    "remappings": "write 'remap'",
-    "params": "write 'parameters'",
-    "respawn": "write 'restart: always' at the node",
-    "respawn_delay": "write 'restart_sec' at the node",
+    "latched": "durability: TRANSIENT_LOCAL",
+    "queue_size": "depth",
+    "pkg": "run: {package: …}",
+    "exec": "run: {executable: …}",
+    "plugin": "run: {component: …}",
+    "args": "run: {command: …}",
+    "cwd": "run: {working_directory: …}",
+    "env": "run: {environment: …}",
+    "remappings": "remap",
+    "params": "parameters",
+    "respawn": "restart: always' beside 'run",
+    "respawn_delay": "restart_sec",
 }
 """What launch files and client libraries say otherwise, and how a manifest writes it."""
-
-
-def _home(key: str) -> str:
-    """Return in which section of a node a manifest has a key; empty for all others."""
-    sections = {"Run": "run", "Qos": "qos", "PublisherFlow": "flows.publishers.NAME"}
-    types = read_schema(MANIFEST)["$defs"]
-    found = (section for name, section in sections.items() if key in types[name]["properties"])
-    return next((f"it is a key of '{section}'" for section in found), "")
 
 
 def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
@@ -331,7 +309,7 @@ def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
     elif types == ["string"] and isinstance(value, (bool, int, float)):
         hint = "put it in quotes"
     elif isinstance(value, str) and {"integer", "number"} & {*types}:
-        hint = _number(value, _name(each))
+        hint = _number(value)
     elif types == ["object"] and value is None:
         hint = "indent below it what belongs to it"
     elif _name(each) == "qos" and type(value) is int:
@@ -346,17 +324,13 @@ def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
     return f"it must be {joined}", hint
 
 
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+))\s*([A-Za-z%µ/]*)\s*")
-
-
-def _number(value: str, name: str) -> str:
-    """Return how to write a number that is in quotes, or has a unit; empty if it is none."""
-    found = _NUMBER.fullmatch(value)
-    if found is None:
+def _number(value: str) -> str:
+    """Return how to write a number that is in quotes; empty if it is none."""
+    try:
+        float(value)
+    except ValueError:
         return ""
-    number, unit = found.groups()
-    is_own = unit.lower() == name.rpartition("_")[2]
-    return f"write {number}" if is_own or not unit else "write the number alone, in the key's unit"
+    return f"write {value.strip()}, without quotes"
 
 
 def _closest(value: object, allowed: list[object]) -> str:

@@ -90,7 +90,7 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
         at = next(each.at for each in after if each.node == circle[1])
         message = f"cannot order nodes that wait for each other: {' → '.join(circle)}"
         found = error("check.after-cycle", at, message, "remove one of these 'after'")
-        raise PlanError.of((found,)) from problem
+        raise ManifestError((found,)) from problem
     levels = []
     while ready := sorter.get_ready():
         levels.append(tuple(sorted(ready, key=order.__getitem__)))
@@ -163,7 +163,8 @@ def build_plan(
         domain_id: 0–232, in the place of the manifest's; None leaves that.
 
     Raises:
-        PlanError: the manifest cannot be planned here, for example an executable is missing.
+        ManifestError: nothing can connect some of its endpoints.
+        PlanError: it cannot be planned here, for example an executable is missing.
         UsageError: ROS_DOMAIN_ID or ROS_AUTOMATIC_DISCOVERY_RANGE is needed and not legal.
     """
     variables = os.environ if environment is None else environment
@@ -262,10 +263,11 @@ def check_plan(
         plan = _wired(manifest, variables, parameters)
     except UsageError:
         return ()  # the environment's fault, reported where it is used
+    except ManifestError as problem:
+        return problem.diagnostics
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
-        alone = error("plan.impossible", at, problem.message, problem.hint)
-        return problem.diagnostics or (alone,)
+        return (error("plan.impossible", at, problem.message, problem.hint),)
     return (*overcrowded(plan, variables), *_without_clock(manifest, parameters))
 
 
@@ -318,7 +320,7 @@ def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodePar
     plan = wire(plan, manifest.links)
     crowded = overcrowded(plan, variables)
     if refused := tuple(each for each in crowded if each.severity is Severity.ERROR):
-        raise PlanError.of(refused)
+        raise ManifestError(refused)
     return plan
 
 

@@ -11,7 +11,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TypeVar
 
 from msgspec.structs import replace
 
@@ -191,7 +190,6 @@ def parameter_text(value: ParameterValue) -> str:
 
 REDACTED = "(redacted)"
 
-_Started = TypeVar("_Started", Run, PlannedProcess)
 
 _SECRET = re.compile(
     "TOKEN|SECRET|PASSW|PASSPHRASE|(^|_)PASS(_|$)|_PWD$|CREDENTIAL|PRIVATE|COOKIE"
@@ -213,13 +211,20 @@ def shown(variable: str, value: str) -> str:
 def without_secrets(plan: Plan) -> Plan:
     """Return `plan` without values of environment variables whose names say they are secret."""
     nodes = tuple(replace(each, run=_redacted(each.run)) for each in plan.nodes)
-    processes = tuple(replace(_redacted(each), run=_redacted(each.run)) for each in plan.processes)
+    processes = tuple(
+        replace(
+            each,
+            run=_redacted(each.run),
+            environment=tuple((name, shown(name, value)) for name, value in each.environment),
+        )
+        for each in plan.processes
+    )
     return replace(plan, nodes=nodes, processes=processes)
 
 
-def _redacted(of: _Started) -> _Started:
+def _redacted(run: Run) -> Run:
     return replace(
-        of, environment=tuple((name, shown(name, value)) for name, value in of.environment)
+        run, environment={name: shown(name, value) for name, value in run.environment.items()}
     )
 
 

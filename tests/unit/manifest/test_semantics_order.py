@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.build import dependency_levels
-from lifecycle.plan.model import PlanError
 from tests.builders import node
 
 Findings = Callable[..., list[str]]
@@ -23,7 +23,7 @@ def circle(edges: dict[str, list[str]]) -> str:
     ]
     try:
         dependency_levels(nodes)
-    except PlanError as problem:
+    except ManifestError as problem:
         (found,) = problem.diagnostics
         return found.message.rpartition(": ")[2]
     return ""
