@@ -38,7 +38,6 @@ from lifecycle.supervisor.core.state import (
     Request,
     Run,
     Step,
-    install,
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
 from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
@@ -273,13 +272,6 @@ def _tick(run: Run, given: messages.Tick) -> list[Event]:
     return events
 
 
-def _adopted(run: Run, given: messages.Adopted) -> list[Event]:
-    install(run, given.plan, own=frozenset(each.planned.process for each in run.nodes.values()))
-    run.adopting, run.adopted = False, given.nodes
-    run.changed()
-    return []
-
-
 def _refused(run: Run, given: messages.Refused) -> list[Event]:
     if run.ending is not None:
         return []
@@ -345,7 +337,6 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     messages.Ordered: orders.ordered,
     messages.Stop: _stop,
     messages.Silent: _silent,
-    messages.Adopted: _adopted,
     messages.Refused: _refused,
     messages.Broken: _broken,
 }

@@ -475,8 +475,6 @@ class Run(msgspec.Struct, kw_only=True):
         left: full names of nodes whose supervisor was shut down, and said so.
         early: keys of the nodes that are configured before any node is wired.
         broken: what processes are started by, or found by, has died.
-        adopted: full names of nodes that ran before, and are left to who started them.
-        adopting: it has still to be known what runs already; nothing is begun before.
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
         came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
@@ -506,8 +504,6 @@ class Run(msgspec.Struct, kw_only=True):
     elsewhere: dict[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] = frozenset()
     early: frozenset[str] = frozenset()
-    adopted: frozenset[str] = frozenset()
-    adopting: bool = False
     broken: bool = False
     revision: int = 1
     revisions: int = 1
@@ -705,7 +701,6 @@ def new_run(plan: Plan, options: UpOptions, *, own: frozenset[str] | None = None
     run.mode = run.mode_by(plan)
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
-    run.adopting = options.adopt
     run.passage = Passage(until_s=run.timeout_s, until=options.until)
     return run
 

@@ -446,24 +446,6 @@ async def test_a_node_that_hangs_is_not_asked_and_is_ended_by_its_watchdog_unles
     assert [each for each in world.story if each in ends] == [*ends]
 
 
-async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
-    tmp_path: Path,
-) -> None:
-    world = SessionWorld(CHAIN, tmp_path)
-    world.hosts.lingers_s = 2.0
-    async with world.running("[system] active"):
-        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
-        world.kill("viewer")
-    assert world.since("viewer start", 2) == [
-        *("viewer start", "/viewer configure", "/viewer connect", "[system] connected at 2.0 s"),
-        *("[system] verified at 2.0 s", "networks programmed (ok)", "[gate] ok: /viewer"),
-        *("/viewer activate", "[system] active at 2.0 s", "[failure] run.process-died /viewer"),
-        "[stopping] at 2.0 s: rolling back",
-        *("/camera deactivate", *CAMERA_DOWN, *over(6)),
-    ]
-    assert world.graph.dropped == ["/viewer"]
-
-
 async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     why = "the fork server does not answer within 10 s"

@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
     Reaction,
     RunKind,
 )
-from lifecycle.plan.build import attached_to
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import wanted
@@ -156,19 +155,6 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     assert play.levels == "1"
     play.give(messages.Saw(elsewhere={"far": frozenset({Condition.STARTED, Condition.CONFIGURED})}))
     assert play.levels == "4"
-
-
-def test_what_ran_before_is_attached_to_before_anything_is_begun() -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"), planned_node("far"))
-    play = Play(plan)
-    play.run = new_run(plan, UpOptions(), own=frozenset({"camera", "viewer"}))
-    play.run.adopting = True
-    assert play.give(messages.Tick()) == []
-    attached, names = attached_to(plan, {"viewer"}), frozenset({"/viewer"})
-    asked = play.give(messages.Adopted(plan=attached, nodes=names))
-    assert [each for each in asked if each.startswith("spawn")] == ["spawn camera"]
-    assert (sorted(play.run.nodes), play.levels) == (["camera", "viewer"], "4 4")
-    assert (play.run.adopted, play.run.adopting) == (names, False)
 
 
 @pytest.mark.parametrize(("managed", "held"), [(True, "viewer configure"), (False, "spawn viewer")])
