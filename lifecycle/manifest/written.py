@@ -24,6 +24,7 @@ from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
     Dscp,
+    EndpointKind,
     EndpointPolicy,
     Health,
     LinkKeys,
@@ -241,6 +242,7 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def _interface_type(kind: str, example: str) -> Meta:
     message = f"write package/{kind}/Type, as in {example}"
     return Meta(
+        description=f"ROS type, package/{kind}/Type.",
         pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
         examples=[example],
         extra_json_schema={"patternErrorMessage": message},
@@ -261,11 +263,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One server or client of an action.
-
-    Attributes:
-        type: ROS type, package/action/Type.
-    """
+    """One server or client of an action."""
 
     type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
 
@@ -282,21 +280,13 @@ class QosEndpoint(Endpoint, frozen=True, kw_only=True):
 
 
 class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One server or client of a service.
-
-    Attributes:
-        type: ROS type, package/srv/Type.
-    """
+    """One server or client of a service."""
 
     type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
 
 
 class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One publisher or subscription.
-
-    Attributes:
-        type: ROS type, package/msg/Type.
-    """
+    """One publisher or subscription."""
 
     type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
@@ -424,21 +414,10 @@ class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     subscriptions: dict[str, SubscriptionFlow] = field(default_factory=dict)
 
 
-class MappedEndpoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Declared names of endpoints, by kind.
-
-    Attributes:
-        publishers, subscriptions: Names as the interface declares them.
-        service_servers, service_clients: Names as the interface declares them.
-        action_servers, action_clients: Names as the interface declares them.
-    """
-
-    publishers: tuple[Text, ...] = ()
-    subscriptions: tuple[Text, ...] = ()
-    service_servers: tuple[Text, ...] = ()
-    service_clients: tuple[Text, ...] = ()
-    action_servers: tuple[Text, ...] = ()
-    action_clients: tuple[Text, ...] = ()
+MappedNames = Annotated[
+    dict[EndpointKind, tuple[Text, ...]],
+    Meta(extra_json_schema={"propertyNames": {"enum": [each.value for each in EndpointKind]}}),
+]
 
 
 class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -446,7 +425,8 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         urls: Connection URLs: TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…].
-        map: Declared names of the endpoints that it carries; 'all' for every one of the node.
+        map: Declared names of the endpoints that it carries, by their list in the interface; 'all'
+            for every one of the node.
     """
 
     urls: Annotated[
@@ -458,7 +438,7 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ],
         ),
     ]
-    map: Literal["all"] | MappedEndpoints = MappedEndpoints()
+    map: Literal["all"] | MappedNames = field(default_factory=dict)
 
 
 class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
