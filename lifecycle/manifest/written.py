@@ -28,6 +28,7 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Health,
     LinkKeys,
+    Name,
     Network,
     NodeKey,
     Parameter,
@@ -78,11 +79,7 @@ B = TypeVar("B", bound=Struct)
 
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
 
-Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
 Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namespace, as in /left")]
-Prefix = Annotated[
-    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
-]
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
@@ -525,7 +522,7 @@ class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     unless: Truth | None = None
     arguments: dict[Name, Scalar] = field(default_factory=dict)
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
 
 
 class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -572,7 +569,7 @@ class Group(Shared, frozen=True, kw_only=True):
     if_: Truth | None = field(name="if", default=None)
     unless: Truth | None = None
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
     machine: Text | None = None
 
 
