@@ -360,6 +360,8 @@ class _Opening:
         for key in ("items", "additionalProperties"):
             if isinstance(schema.get(key), dict):
                 schema[key] = self.value(schema[key])
+        if "propertyNames" in schema:
+            schema["propertyNames"] = self._branch(schema["propertyNames"])
         if "enum" in schema:
             words = self.order.get(frozenset(schema["enum"]), schema["enum"])
             schema["enum"] = words if isinstance(words, str) else list(words)
@@ -367,9 +369,8 @@ class _Opening:
                 schema = {"type": "string", **schema}
             if len(words) == 1 and not isinstance(words[0], str):
                 schema["const"] = schema.pop("enum")[0]
-        for each in (schema, schema.get("propertyNames", {})):
-            if "pattern" in each:  # \Z is Python's, and $ ECMA 262's
-                each["pattern"] = each["pattern"].replace(r"\Z", "$")
+        if "pattern" in schema:  # \Z is Python's, and $ ECMA 262's
+            schema["pattern"] = schema["pattern"].replace(r"\Z", "$")
         return schema
 
 

@@ -195,7 +195,6 @@ def read_interface(
     return Interface(
         endpoints=tuple(reading.endpoints),
         parameters=tuple(reading.parameters),
-        source=reference,
         has_all_parameters=True,
     )
 

@@ -24,9 +24,11 @@ from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
     Dscp,
+    EndpointKind,
     EndpointPolicy,
     Health,
     LinkKeys,
+    Name,
     Network,
     NodeKey,
     Parameter,
@@ -77,11 +79,7 @@ B = TypeVar("B", bound=Struct)
 
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
 
-Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
 Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namespace, as in /left")]
-Prefix = Annotated[
-    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
-]
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
@@ -241,6 +239,7 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def _interface_type(kind: str, example: str) -> Meta:
     message = f"write package/{kind}/Type, as in {example}"
     return Meta(
+        description=f"ROS type, package/{kind}/Type.",
         pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
         examples=[example],
         extra_json_schema={"patternErrorMessage": message},
@@ -261,11 +260,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One server or client of an action.
-
-    Attributes:
-        type: ROS type, package/action/Type.
-    """
+    """One server or client of an action."""
 
     type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
 
@@ -282,21 +277,13 @@ class QosEndpoint(Endpoint, frozen=True, kw_only=True):
 
 
 class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One server or client of a service.
-
-    Attributes:
-        type: ROS type, package/srv/Type.
-    """
+    """One server or client of a service."""
 
     type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
 
 
 class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One publisher or subscription.
-
-    Attributes:
-        type: ROS type, package/msg/Type.
-    """
+    """One publisher or subscription."""
 
     type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
@@ -424,21 +411,10 @@ class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     subscriptions: dict[str, SubscriptionFlow] = field(default_factory=dict)
 
 
-class MappedEndpoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Declared names of endpoints, by kind.
-
-    Attributes:
-        publishers, subscriptions: Names as the interface declares them.
-        service_servers, service_clients: Names as the interface declares them.
-        action_servers, action_clients: Names as the interface declares them.
-    """
-
-    publishers: tuple[Text, ...] = ()
-    subscriptions: tuple[Text, ...] = ()
-    service_servers: tuple[Text, ...] = ()
-    service_clients: tuple[Text, ...] = ()
-    action_servers: tuple[Text, ...] = ()
-    action_clients: tuple[Text, ...] = ()
+MappedNames = Annotated[
+    dict[EndpointKind, tuple[Text, ...]],
+    Meta(extra_json_schema={"propertyNames": {"enum": [each.value for each in EndpointKind]}}),
+]
 
 
 class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -446,7 +422,8 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         urls: Connection URLs: TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…].
-        map: Declared names of the endpoints that it carries; 'all' for every one of the node.
+        map: Declared names of the endpoints that it carries, by their list in the interface; 'all'
+            for every one of the node.
     """
 
     urls: Annotated[
@@ -458,7 +435,7 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ],
         ),
     ]
-    map: Literal["all"] | MappedEndpoints = MappedEndpoints()
+    map: Literal["all"] | MappedNames = field(default_factory=dict)
 
 
 class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -545,7 +522,7 @@ class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     unless: Truth | None = None
     arguments: dict[Name, Scalar] = field(default_factory=dict)
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
 
 
 class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -592,7 +569,7 @@ class Group(Shared, frozen=True, kw_only=True):
     if_: Truth | None = field(name="if", default=None)
     unless: Truth | None = None
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
     machine: Text | None = None
 
 
