@@ -31,7 +31,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.network.connection_url import ConnectionUrlError, check_together
 from lifecycle.network.nfe import may_be_same
-from lifecycle.network.ports import DG, domain_base, owner_of
+from lifecycle.network.ports import DG, domain_base
 
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",
@@ -324,22 +324,15 @@ def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic
     domain = discovery.domain_id or 0
     if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
         return
+    base = domain_base(domain)
     for use in uses:
-        owner = None if use.tcp else owner_of(use.port)
-        if owner is None or owner.domain_id != domain:
-            continue
-        whose = (
-            "every participant"
-            if owner.participant_id is None
-            else f"participant {owner.participant_id}"
-        )
-        message = (
-            f"cannot give UDP port {use.port} to the {use.what}: in domain {domain} it is the "
-            f"{owner.role.replace('_', ' ')} port of {whose}"
-        )
-        base = domain_base(domain)
-        hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
-        yield error("check.connection-ports", use.at, message, hint)
+        if not use.tcp and use.port in range(base, base + DG):
+            message = (
+                f"cannot give UDP port {use.port} to the {use.what}: domain {domain} has it for "
+                "its participants"
+            )
+            hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
+            yield error("check.connection-ports", use.at, message, hint)
 
 
 def check_urls(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:

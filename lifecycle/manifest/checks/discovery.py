@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
     DataLayerSource,
     DiscoveryMode,
     DiscoveryRange,
-    EndpointKind,
     FlowTransport,
     Machine,
     Node,
@@ -38,11 +37,9 @@ from lifecycle.network.ports import (
     LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
-    EphemeralRange,
     describe_domains,
     domain_of,
     max_participants,
-    overflows,
     safe_domains,
 )
 
@@ -354,10 +351,6 @@ def _has_ipv6(environment: Mapping[str, str]) -> bool:
     )
 
 
-_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
-"""Asks for the limits that hold whatever an operating system does with its ports."""
-
-
 def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the domain, and about room for all participants.
 
@@ -384,29 +377,20 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield note("check.domain", section or start, message, hint)
     for host in system.hosts.values():
         at = section or host[0].at
-        refused = [*_crowded(system, host, domain, _NO_EPHEMERAL)]
-        yield from (error("check.ports", at, *each) for each in refused)
-        if room and not refused:
-            crowded = _crowded(system, host, domain, LINUX)
-            yield from (note("check.ports", at, *each) for each in crowded)
+        nodes = _nodes_on(system, host)
+        needed = _participants(nodes, system)
+        # What holds whatever an operating system does with its ports, then Linux's default.
+        for ephemeral, make in ((range(0), error), (LINUX if room else range(0), note)):
+            capacity = max_participants(domain, ephemeral)
+            if needed > capacity.participants:
+                message = (
+                    f"cannot run {needed} participants in domain {domain} on "
+                    f"{_spell_host(nodes)}: {capacity.participants} fit before {capacity.limit}"
+                )
+                hint = "use another domain, run fewer processes, or have fewer unique publishers"
+                yield make("check.ports", at, message, hint)
+                break
         yield from _beyond_localhost(system, host)
-
-
-def _crowded(
-    system: DeclaredSystem, host: list[Machine], domain: int, ephemeral: EphemeralRange
-) -> Iterator[tuple[str, str]]:
-    """Yield message and hint of each kind of port that a host has too few of."""
-    nodes = _nodes_on(system, host)
-    needs = [each for node in nodes for each in system.needs.of_node(node) if each.unique]
-    for each in overflows(
-        domain,
-        participants=_participants(nodes, system),
-        unique_subscriptions=sum(each.need.kind is EndpointKind.SUBSCRIPTION for each in needs),
-        host=_spell_host(nodes),
-        ephemeral=ephemeral,
-    ):
-        message, _, hint = each.partition("; ")
-        yield message, hint
 
 
 def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:
