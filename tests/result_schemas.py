@@ -235,11 +235,15 @@ def generate_manifest() -> str:
     )
     found = {each.__name__: each for type_ in types for each in _types(type_)}
     words = {
-        each: [each.value for each in type_] for each, type_ in found.items() if _is_enum(type_)
+        each: [each.value for each in type_ if each.value != "UNKNOWN"]  # that is only observed
+        for each, type_ in found.items()
+        if _is_enum(type_)
     }
     for name, type_ in found.items():
         if name not in words:
             defs[name] = _section(type_, defs[name])
+    for each in defs["Qos"]["properties"].values():
+        each.pop("default", None)  # of the endpoint's kind
     reaction = {"enum": list(get_args(written.Word))}
     for_rules["not"] = {"required": ["mode"]}
     names = [name for each in code_points() for name in (each.name, *each.aliases)]

@@ -48,6 +48,7 @@ from lifecycle.manifest.model import (
     require,
     spelled,
 )
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
@@ -83,7 +84,6 @@ Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namesp
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
-Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
 """What `if:` and `unless:` may be once their substitutions are resolved."""
@@ -303,39 +303,22 @@ Preset = Literal[
 """A QoS profile by its ROS name (rmw/qos_profiles.h)."""
 
 
-class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Qos(QosProfile, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """QoS profile, with rmw's names.
 
     What is left out is taken from 'preset', or from the default of the endpoint's kind.
 
     Attributes:
         preset: Preset by its ROS name (rmw/qos_profiles.h).
-        history: Which messages are kept.
-        depth: Messages kept under KEEP_LAST, at least 1.
-        reliability: Whether lost messages are sent again.
-        durability: Whether late subscriptions get earlier messages.
-        deadline_ns: Longest time between two messages, nanoseconds.
-        lifespan_ns: Age at which messages expire, nanoseconds.
-        liveliness: Who asserts that the publisher is alive.
-        liveliness_lease_duration_ns: Time without assertion after which a publisher counts as gone,
-            nanoseconds.
     """
 
     preset: Preset | None = None
-    history: Literal["SYSTEM_DEFAULT", "KEEP_LAST", "KEEP_ALL"] | None = None
-    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] | None = None
-    reliability: Literal["SYSTEM_DEFAULT", "RELIABLE", "BEST_EFFORT", "BEST_AVAILABLE"] | None = (
-        None
-    )
-    durability: (
-        Literal["SYSTEM_DEFAULT", "TRANSIENT_LOCAL", "VOLATILE", "BEST_AVAILABLE"] | None
-    ) = None
-    deadline_ns: Nanoseconds | None = None
-    lifespan_ns: Nanoseconds | None = None
-    liveliness: (
-        Literal["SYSTEM_DEFAULT", "AUTOMATIC", "MANUAL_BY_TOPIC", "BEST_AVAILABLE"] | None
-    ) = None
-    liveliness_lease_duration_ns: Nanoseconds | None = None
+    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 10
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is only observed."""
+        kinds = (self.history, self.reliability, self.durability, self.liveliness)
+        require(all(each.value != "UNKNOWN" for each in kinds))
 
 
 class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
