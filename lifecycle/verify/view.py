@@ -167,6 +167,11 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return flow_subject(self.planned.topic, self.publisher, self.subscription)
 
     @property
+    def where(self) -> str:
+        """How messages name it."""
+        return f"the flow {self.publisher} → {self.subscription} on {self.planned.topic}"
+
+    @property
     def ends(self) -> tuple[str, str]:
         """Fully qualified names of the two nodes."""
         return self.publisher, self.subscription

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import msgspec
 
-from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
+from lifecycle.ci_formats import Case, Problem, github, junit, sarif
 from lifecycle.cli import common
 from lifecycle.cli.report import report_format, report_option, write_report
 from lifecycle.codec import Count
@@ -134,7 +134,7 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
                 note="\n".join([*said, *notes]),
             )
         )
-    return junit([Suite(name=f"lifecycle check {report.manifest}", cases=cases)])
+    return junit(f"lifecycle check {report.manifest}", cases)
 
 
 def _test(rule: str) -> str:

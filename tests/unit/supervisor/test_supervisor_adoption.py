@@ -119,7 +119,7 @@ async def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_
     assert world.messages == ["cannot adopt /new: 2 nodes are named so"]
     assert world.report == (
         "ended before it was connected, exit code 4: the verdict keeps the gate closed; "
-        "wrong: /new (graph.duplicate-node)"
+        "/new (graph.duplicate-node)"
     )
 
 

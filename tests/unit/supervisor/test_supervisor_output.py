@@ -196,11 +196,11 @@ def test_a_verdict_is_said_once_and_before_active_as_what_is_still_wrong() -> No
     wrong = replace(ok, verdict=verdict_of(Outcome.VIOLATED, "state.wrong-state"))
     active = SystemReached(reached="active", elapsed_s=1.0)
     assert written(PlainLines, wrong, active, ok, ok, EVENTS[0], ok, wrong, wrong, ok) == [
-        "not active yet; wrong: /camera (state.wrong-state)",
+        "not active yet; /camera (state.wrong-state)",
         "system active after 1.00 s",
         "active: verdict ok",
         "process camera: running (pid 7)",
-        "active: verdict violated; wrong: /camera (state.wrong-state)",
+        "active: verdict violated; /camera (state.wrong-state)",
         "active: verdict ok",
     ]
 

@@ -18,7 +18,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import with_findings, without_findings
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
-from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
+from lifecycle.verify.verdict import Stage, ToleratedNode, Verdict
 from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report, drop_node
 from tests.unit.verify.lines import verify
@@ -39,10 +39,6 @@ def plan_of(**policy: object) -> Plan:
 
 def judged(plan: Plan, *edits: Edit) -> Verdict:
     return verify(plan, both(*edits)(perfect(plan)), stage=Stage.CONNECTED)
-
-
-def has(kind: EndpointKind, node: str, name: str, type_: str = STRING) -> OpenEndpoint:
-    return OpenEndpoint(kind=kind, node=node, name=name, type=type_)
 
 
 def test_a_verdict_without_a_finding_is_as_if_it_had_not_been_made_its_flows_too() -> None:
@@ -77,21 +73,6 @@ def test_what_a_supervisor_finds_itself_comes_first_and_makes_a_verdict_no_bette
         assert added.findings == (*found, *verdict.findings)
 
 
-def test_undeclared_endpoints_of_nodes_that_may_have_such_are_listed_and_no_others() -> None:
-    verdict = judged(
-        plan_of(),
-        add_endpoint(PUB, "/one", "/extra", gid="1"),
-        add_endpoint(CLIENT, "/one", "/ask", type="a/srv/B"),
-        add_endpoint(PUB, "/two", "/other", gid="2"),
-    )
-    assert verdict.open_endpoints == (
-        has(CLIENT, "/one", "/ask", "a/srv/B"),
-        has(PUB, "/one", "/extra"),
-    )
-    assert [each.subject for each in verdict.findings] == ["/other"]
-    assert verdict.tolerated == ()
-
-
 LISTENERS = both(
     add_node("/rviz2"),
     add_endpoint(SUB, "/rviz2", "/a", gid="1", qos=QosProfile()),
@@ -100,17 +81,9 @@ LISTENERS = both(
     add_node("/launch_ros_1"),
 )
 TOOLS = (
-    ToleratedNode(
-        node="/_ros2cli_7",
-        because="tolerated_nodes: _ros2cli_*",
-        endpoints=(has(SUB, "/_ros2cli_7", "/a"),),
-    ),
+    ToleratedNode(node="/_ros2cli_7", because="tolerated_nodes: _ros2cli_*"),
     ToleratedNode(node="/launch_ros_1", because="tolerated_nodes: launch_ros_*"),
-    ToleratedNode(
-        node="/rviz2",
-        because="tolerated_nodes: rviz2",
-        endpoints=(has(SUB, "/rviz2", "/a"), has(CLIENT, "/rviz2", "/ask", "a/srv/B")),
-    ),
+    ToleratedNode(node="/rviz2", because="tolerated_nodes: rviz2"),
 )
 
 

@@ -256,7 +256,7 @@ def test_what_changes_behind_an_open_gate_and_heals_in_time_ends_no_bring_up(
     ("found", "wait_s", "why"),
     [
         (INTRUDER, 1.0, f"; wrong: {STRANGER}"),
-        (GONE, 32.0, f", and {OVER}; missing: /camera (node)"),
+        (GONE, 32.0, f", and {OVER}; /camera (graph.missing-node)"),
     ],
 )
 def test_what_stays_wrong_behind_an_open_gate_ends_the_bring_up_and_is_named(
