@@ -446,8 +446,8 @@ def _clock(view: View, flows: Sequence[FlowView], sample: Sample | None) -> Cloc
     if not far:
         return SAME_CLOCK
     clocks = view.clocks or {}
-    # Where no shift is, it was counted as of this host's clock: the plan was another then.
-    if sample is None or sample.used.shift_ns is None or not far <= clocks.keys():
+    # It may have been counted as of this host's clock: the plan was another then.
+    if sample is None or not sample.used.apart or not far <= clocks.keys():
         return None
     near = [] if all(map(_differ, flows)) else [SAME_CLOCK]
     return ClockOffset.any_of((*near, *(clocks[each] for each in far)))

@@ -255,7 +255,7 @@ def test_what_changes_behind_an_open_gate_and_heals_in_time_ends_no_bring_up(
 @pytest.mark.parametrize(
     ("found", "wait_s", "why"),
     [
-        (INTRUDER, 1.0, f"; wrong: {STRANGER}"),
+        (INTRUDER, 1.0, f"; {STRANGER}"),
         (GONE, 32.0, f", and {OVER}; /camera (graph.missing-node)"),
     ],
 )
@@ -275,7 +275,7 @@ def test_what_became_active_is_judged_again_and_must_be_what_was_verified() -> N
     play.see(INTRUDER)
     play.finish("viewer activate")
     play.wait(1.0)
-    why = f"what became active is not what was verified; wrong: {STRANGER}"
+    why = f"what became active is not what was verified; {STRANGER}"
     assert (play.code, play.reason) == (4, why)
 
 
@@ -378,7 +378,7 @@ def _hold(play: Play) -> None:
         (_pause, 0, ""),
         (_restart, 143, "; the system was restarting, not active"),
         (_restart_and_see, 143, f"; the system was restarting, not active; {PASSED}"),
-        (_violate, 0, f"; violated meanwhile, wrong: {STRANGER}"),
+        (_violate, 0, f"; violated meanwhile, {STRANGER}"),
         (_hold, 4, f"; held at the gate, and not active; {PASSED}"),
     ],
 )
