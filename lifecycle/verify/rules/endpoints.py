@@ -16,11 +16,12 @@ from typing import Any
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest.names import SUPERVISORS
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.tool_filter import action_part, of_supervisors, part_type
+from lifecycle.verify.tool_filter import action_part, is_of_observer, part_type
 from lifecycle.verify.verdict import Finding, Stage
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 
@@ -333,19 +334,15 @@ def _unverifiable(node: str, ends: list[SeenEndpoint]) -> Finding:
 
 
 def _offered_by_tools(view: View) -> Iterator[Finding]:
-    supervisors = of_supervisors(view.plan, view.of_tools)
-    for endpoint in view.of_tools:
-        if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
+    for each in view.of_tools:
+        if not view.names.fed_by(each.kind, each.name):
             continue
-        of_supervisor = (endpoint.kind, endpoint.name) in view.names.of_supervisors
-        yield _not_declared(
-            endpoint,
-            hint="only the supervisor of this system offers it; if several nodes do, none is taken"
-            " for the supervisor: stop those that are not"
-            if of_supervisor
-            else f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
-            " it, or declare its node",
-        )
+        if not is_of_observer(each.kind, each.node, each.name, each.type):
+            yield _not_declared(
+                each,
+                hint=f"policy.tolerated_nodes ({view.tools[each.node]}) lets it listen only: stop"
+                " it, or declare its node",
+            )
 
 
 def _unattributed(view: View) -> Iterator[Finding]:
@@ -355,9 +352,9 @@ def _unattributed(view: View) -> Iterator[Finding]:
     """
     for endpoint in view.unattributed:
         word = endpoint.kind.noun
-        place, names = (endpoint.kind, endpoint.name), view.names
         # The supervisor of another machine begins to offer what is its own after its gate.
-        feeds = names.fed_by(*place) and place not in names.of_supervisors
+        its_own = endpoint.name.startswith(SUPERVISORS)
+        feeds = view.names.fed_by(endpoint.kind, endpoint.name) and not its_own
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
             outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
