@@ -30,7 +30,7 @@ from lifecycle.verify.verdict import (
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, View, flow_subject
+from lifecycle.verify.view import Actual, FlowView, View, Whose, flow_subject
 
 _OF_NUMBERS = frozenset(each.id for each in OF_NUMBERS)
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
@@ -246,7 +246,7 @@ def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     tools = {name: pattern for name, pattern in view.tools.items() if pattern != OUR_NODES}
     because = {name: f"tolerated_nodes: {pattern}" for name, pattern in tools.items()}
     if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
-        others = {*view.observed, *(each.node for each in (*view.foreign, *view.unattributed))}
+        others = {*view.observed, *(each.node for each in view.of(Whose.FOREIGN, Whose.UNKNOWN))}
         because |= dict.fromkeys(others - view.planned.keys(), "undeclared_nodes: open")
     return tuple(ToleratedNode(node=name, because=because[name]) for name in sorted(because))
 

@@ -37,7 +37,9 @@ from lifecycle.verify.view import (
     FlowView,
     NodeFacts,
     SeenEndpoint,
+    TopicEnds,
     View,
+    Whose,
     actual_qos,
     is_beyond,
     may_hide,
@@ -73,7 +75,7 @@ def lay_out(
     observed = _graph_nodes(observation.nodes, planned, hidden, tools)
     parameters = {each.node: each for each in observation.parameters}
     nodes: dict[str, NodeFacts] = {}
-    left_over: list[ObservedEndpoint] = []
+    others: list[SeenEndpoint] = []
     for name, node in planned.items():
         configuration = configurations.get(name)
         matched, rest = _match_node(
@@ -88,10 +90,14 @@ def lay_out(
             absent=name not in observed and all(each.observed is None for each in matched),
         )
         # A second node of the same name has the same endpoints again; that is one finding.
-        left_over += () if name in duplicated else rest
+        whose = Whose.TWIN if name in duplicated else Whose.UNDECLARED
+        others += (SeenEndpoint.of(each, whose) for each in rest)
     actual = tuple(itertools.chain.from_iterable(facts.actual for facts in nodes.values()))
-    strangers = [name for name in groups if name and name not in planned and name not in tools]
-    of_tools = tuple(each for name in groups if name in tools for each in groups[name])
+    for name in groups.keys() - planned.keys():
+        known = Whose.TOOL if name in tools else Whose.FOREIGN
+        others += (SeenEndpoint.of(each, known if name else Whose.UNKNOWN) for each in groups[name])
+    others += (SeenEndpoint.of(each, Whose.DEPARTED) for each in observation.departed)
+    found = _without_halves(others, groups, actual)
     return View(
         plan=plan,
         stage=stage,
@@ -105,17 +111,9 @@ def lay_out(
         configurations=configurations,
         nodes=nodes,
         actual=actual,
-        undeclared=_undeclared(left_over, groups, actual),
-        unattributed=groups.get("", ()),
-        foreign=tuple(each for name in strangers for each in groups[name]),
+        others=found,
+        topics=_topics(actual, found),
         tools=tools,
-        of_tools=of_tools,
-        groups=groups,
-        seen=_seen(groups, actual, tools),
-        seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
-        departed=tuple(
-            replace(SeenEndpoint.of(each), has_ended=True) for each in observation.departed
-        ),
         flows=_flows(plan, nodes, actual),
         uniqueness=Uniqueness(
             reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
@@ -223,10 +221,6 @@ def _tools(
     return {name: pattern for name, pattern in found.items() if pattern}
 
 
-def _topical(endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
-    return (each for each in endpoints if each.kind.is_topic)
-
-
 def _match_node(
     node: PlannedNode,
     configuration: NodeConfiguration | None,
@@ -324,14 +318,12 @@ def _as_observed(node: PlannedNode, report: EndpointReport) -> ObservedEndpoint:
     )
 
 
-def _undeclared(
-    left_over: Sequence[ObservedEndpoint],
+def _without_halves(
+    others: Iterable[SeenEndpoint],
     groups: Mapping[str, tuple[ObservedEndpoint, ...]],
     actual: Iterable[Actual],
-) -> tuple[ObservedEndpoint, ...]:
-    """Leave out of what no declaration covers the parts of declared actions that are half seen."""
-    if not any(action_part(each.kind, each.name) for each in left_over):
-        return _sorted(left_over)
+) -> tuple[SeenEndpoint, ...]:
+    """Leave out the parts of declared actions that are half seen; sort what is left."""
     seen = {
         (each.node, each.kind, each.name)
         for group in groups.values()
@@ -340,14 +332,36 @@ def _undeclared(
     }
     declared = {(each.node, each.kind, each.name): each.planned.type for each in actual}
 
-    def is_half(endpoint: ObservedEndpoint) -> bool:
+    def is_half(endpoint: SeenEndpoint) -> bool:
         action = action_part(endpoint.kind, endpoint.name)
-        place = (endpoint.node, *action) if action is not None else None
-        if place not in declared or (place in seen and endpoint.gid):
+        if action is None or endpoint.whose is not Whose.UNDECLARED:
+            return False
+        place = (endpoint.node, *action)
+        if place not in declared or (place in seen and _gid(endpoint)):
             return False
         return endpoint.type == part_type(endpoint.name, declared[place])
 
-    return _sorted(each for each in left_over if not is_half(each))
+    return tuple(
+        sorted(
+            (each for each in others if not is_half(each)),
+            key=lambda each: (each.node, each.name, each.kind.value, each.type, _gid(each)),
+        )
+    )
+
+
+def _gid(endpoint: SeenEndpoint) -> str:
+    return "" if endpoint.observed is None else endpoint.observed.gid
+
+
+def _topics(actual: Iterable[Actual], others: Iterable[SeenEndpoint]) -> dict[str, TopicEnds]:
+    """Collect publishers and subscriptions; one beyond reach is counted by what it matches."""
+    found: dict[str, TopicEnds] = {}
+    seen = (each for each in actual if each.observed is not None or each.beyond)
+    for each in itertools.chain(seen, others):
+        if each.kind.is_topic:
+            ends = found.setdefault(each.name, ([], []))
+            ends[each.kind is EndpointKind.SUBSCRIPTION].append(each)
+    return found
 
 
 def _graph_nodes(
@@ -392,32 +406,11 @@ def _actual(
         report=report,
         planned=planned,
         type_hash=type_hash,
-        is_shown=observed is not None or report is not None,
         owner=node,
         observed=observed,
         unseen=unseen,
         beyond=beyond,
     )
-
-
-def _seen(
-    groups: Mapping[str, tuple[ObservedEndpoint, ...]],
-    actual: Sequence[Actual],
-    tools: Collection[str],
-) -> tuple[SeenEndpoint, ...]:
-    """Collect publishers and subscriptions with all that is known of them."""
-    topical = [each for each in actual if each.kind.is_topic]
-    # Not visible here, but the endpoints that match them count them.
-    found: list[SeenEndpoint] = [each for each in topical if each.beyond and each.observed is None]
-    declared = {id(each.observed): each for each in topical if each.observed is not None}
-    found += [
-        declared.get(id(each)) or SeenEndpoint.of(each)
-        for name, group in groups.items()
-        if name not in tools
-        for each in _topical(group)
-    ]
-    found += [each for each in topical if each.unseen and each.observed is not None]
-    return tuple(found)
 
 
 def _flows(

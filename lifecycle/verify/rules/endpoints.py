@@ -10,7 +10,6 @@ it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -23,7 +22,7 @@ from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.tool_filter import action_part, is_of_observer, part_type
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import Actual, SeenEndpoint, View
+from lifecycle.verify.view import Actual, SeenEndpoint, View, Whose
 
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
@@ -71,14 +70,11 @@ UNDECLARED = {
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence, the type, and its definition, of endpoints; then those of outsiders."""
-    known: Counter[tuple[str, EndpointKind | None]] = Counter()
-    if any(actual.unseen for actual in view.actual):
-        known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
     for facts in view.nodes.values():
         for actual in facts.actual:
             yield from _declared(actual, absent=facts.absent)
             if actual.unseen and not facts.absent:
-                yield from _unseen(view, actual, known)
+                yield from _unseen(view, actual)
     yield from _undeclared(view)
     yield from _conflicts(view)
     yield from _definitions(view)
@@ -112,9 +108,7 @@ def _remapped(actual: Actual) -> str:
     )
 
 
-def _unseen(
-    view: View, actual: Actual, known_ends: Counter[tuple[str, EndpointKind | None]]
-) -> Iterator[Finding]:
+def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
     report = actual.report
     if report is None:
@@ -124,7 +118,9 @@ def _unseen(
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = known_ends[actual.name, actual.kind.other_end]
+        publishers, subscriptions = view.topics.get(actual.name, ((), ()))
+        ends = subscriptions if actual.kind is EndpointKind.PUBLISHER else publishers
+        known = sum(each.whose is not Whose.DEPARTED for each in ends)
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return
@@ -133,7 +129,7 @@ def _unseen(
 
 
 def _undeclared(view: View) -> Iterator[Finding]:
-    for endpoint in view.undeclared:
+    for endpoint in view.of(Whose.UNDECLARED):
         node = view.planned[endpoint.node]
         wrong = _wrong_part(view, endpoint)
         if wrong is not None:
@@ -154,7 +150,7 @@ def _undeclared(view: View) -> Iterator[Finding]:
         yield _not_declared(endpoint, at=node.at, hint=hint)
 
 
-def _not_declared(endpoint: ObservedEndpoint, **fields: Any) -> Finding:
+def _not_declared(endpoint: SeenEndpoint, **fields: Any) -> Finding:
     word = endpoint.kind.noun
     return UNDECLARED[endpoint.kind].finding(
         **_named(endpoint),
@@ -164,13 +160,12 @@ def _not_declared(endpoint: ObservedEndpoint, **fields: Any) -> Finding:
     )
 
 
-def _named(end: SeenEndpoint | ObservedEndpoint) -> dict[str, Any]:
+def _named(end: SeenEndpoint) -> dict[str, Any]:
     """Return what a finding is on that is on an endpoint, declared or not."""
-    who = f"the {end.kind.noun} of {end.name} in {end.node or 'an unknown node'}"
-    return {"subject": end.name, "who": who, "node": end.node, "endpoint": end.kind}
+    return {"subject": end.name, "who": end.where, "node": end.node, "endpoint": end.kind}
 
 
-def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
+def _wrong_part(view: View, endpoint: SeenEndpoint) -> Finding | None:
     """Judge a part of an action that its node declares; None for everything else."""
     part = action_part(endpoint.kind, endpoint.name)
     if part is None:
@@ -192,12 +187,7 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
     types = {(each.kind.meets_in, each.name): each.planned.type for each in view.actual}
-    others = (*view.undeclared, *view.foreign, *view.unattributed)
-    undeclared = (
-        *(each for each in view.seen if each.planned is None),
-        *(SeenEndpoint.of(each) for each in others if not each.kind.is_topic),
-    )
-    for seen in undeclared:
+    for seen in view.of(Whose.UNDECLARED, Whose.TWIN, Whose.FOREIGN, Whose.UNKNOWN):
         what = seen.kind.meets_in
         declared = types.get((what, seen.name), seen.type)
         if seen.type == declared:
@@ -273,15 +263,12 @@ def _definitions(view: View) -> Iterator[Finding]:
 def _ends(view: View) -> dict[_Place, list[SeenEndpoint]]:
     """Return the ends of all topics, services and actions by where they meet.
 
-    Those of topics come first, by topic, then those of services and actions.
+    What tools have of topics is their own matter.
     """
-    others = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
-    services = (
-        *(each for each in view.actual if each.observed is not None),
-        *map(SeenEndpoint.of, others),
-    )
     found: dict[_Place, list[SeenEndpoint]] = {}
-    for end in (*view.seen, *(each for each in services if not each.kind.is_topic)):
+    declared = (each for each in view.actual if each.observed is not None or each.beyond)
+    others = (each for each in view.others if not (each.is_passing and each.kind.is_topic))
+    for end in (*declared, *others):
         found.setdefault(_place(end), []).append(end)
     return found
 
@@ -334,7 +321,7 @@ def _unverifiable(node: str, ends: list[SeenEndpoint]) -> Finding:
 
 
 def _offered_by_tools(view: View) -> Iterator[Finding]:
-    for each in view.of_tools:
+    for each in view.of(Whose.TOOL):
         if not view.names.fed_by(each.kind, each.name):
             continue
         if not is_of_observer(each.kind, each.node, each.name, each.type):
@@ -350,7 +337,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
 
     After it, who only listens may be a tool whose name has yet to come; who feeds may not.
     """
-    for endpoint in view.unattributed:
+    for endpoint in view.of(Whose.UNKNOWN):
         word = endpoint.kind.noun
         # The supervisor of another machine begins to offer what is its own after its gate.
         its_own = endpoint.name.startswith(SUPERVISORS)
@@ -359,15 +346,17 @@ def _unattributed(view: View) -> Iterator[Finding]:
         yield UNATTRIBUTED_ENDPOINT.finding(
             outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
             subject=endpoint.name,
-            who=f"this {word} of {endpoint.name}{described(endpoint)}",
+            who=f"this {word} of {endpoint.name}{_described(endpoint.observed)}",
             expected="that of a declared node",
             observed="that of an unknown node",
             endpoint=endpoint.kind,
         )
 
 
-def described(endpoint: ObservedEndpoint) -> str:
+def _described(endpoint: ObservedEndpoint | None) -> str:
     """Describe an endpoint's participant as far as it is known: address, GID; else empty."""
-    address = f"at {endpoint.address}" if endpoint.address else ""
-    known = [each for each in (address, endpoint.gid and f"GID {endpoint.gid}") if each]
+    if endpoint is None:
+        return ""
+    known = [f"at {endpoint.address}"] if endpoint.address else []
+    known += [f"GID {endpoint.gid}"] if endpoint.gid else []
     return f" ({', '.join(known)})" if known else ""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
@@ -26,7 +26,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import FlowView, SeenEndpoint, View, brings_up
+from lifecycle.verify.view import FlowView, SeenEndpoint, TopicEnds, View, Whose, brings_up
 
 _rule = functools.partial(
     Rule,
@@ -73,10 +73,7 @@ Match = tuple[Outcome, str]
 _OK: Match = (Outcome.OK, "")
 
 
-_Ends = tuple[list[SeenEndpoint], list[SeenEndpoint]]
-"""All publishers and all subscriptions of a topic, tools' and those that have ended included."""
-
-_NO_ENDS: _Ends = ([], [])
+_NO_ENDS: TopicEnds = ([], [])
 
 
 def obstacle(publisher: SeenEndpoint, subscription: SeenEndpoint) -> str:
@@ -124,18 +121,14 @@ def match(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow, every end that reports how many peers it has, every client."""
-    topics: dict[str, _Ends] = {}
-    for each in (*view.seen, *view.seen_of_tools, *view.departed):
-        publishers, subscriptions = topics.setdefault(each.name, ([], []))
-        (publishers if each.kind is EndpointKind.PUBLISHER else subscriptions).append(each)
     for flow in view.flows:
-        yield from _judge_flow(flow, topics.get(flow.planned.topic, _NO_ENDS))
-    yield from _unknown_peers(view, topics)
+        yield from _judge_flow(flow, view.topics.get(flow.planned.topic, _NO_ENDS))
+    yield from _unknown_peers(view)
     yield from _unreported_flows(view)
     yield from _clients(view)
 
 
-def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]:
+def _unknown_peers(view: View) -> Iterator[Finding]:
     """Find declared ends that are matched with more than all that can match them.
 
     That is what the graph shows, and what is declared and not seen (yet), which has a finding of
@@ -154,10 +147,10 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
             continue
         if not brings_up(actual.owner, view.machines):
             continue
-        publishers, subscriptions = topics.get(actual.name, _NO_ENDS)
+        publishers, subscriptions = view.topics.get(actual.name, _NO_ENDS)
         publishes = actual.kind is EndpointKind.PUBLISHER
         known = _possible(actual, subscriptions if publishes else publishers)
-        possible = sum(not each.has_ended for each in known)
+        possible = sum(each.whose is not Whose.DEPARTED for each in known)
         other = actual.kind.other_end
         place = (other, actual.name)
         if place in NOISE_TOPICS or report.matched <= len(known) + unseen[place]:
@@ -192,7 +185,7 @@ def is_unreported(flow: FlowView) -> bool:
     return all(end.report is None or end.report.matched is None for end in flow.endpoints)
 
 
-def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
+def _judge_flow(flow: FlowView, ends: TopicEnds) -> Iterator[Finding]:
     linked = flow.planned.linked
     if cause := _cause(flow):
         outcome, reason = Outcome.VIOLATED, cause
@@ -230,12 +223,13 @@ def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | No
     if report is None or report.matched is None:
         return None
     matched, known = report.matched, _possible(end, others)
-    possible = [each for each in known if not each.has_ended]
+    possible = [each for each in known if each.whose is not Whose.DEPARTED]
     word = f"the {end.kind.noun}"
     reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched none"
     if matched in (len(possible), len(known)):
         return _OK
-    if matched < len(possible) and (matched == 0 or not any(each.is_stranger for each in possible)):
+    knows_all = all(each.whose is Whose.DECLARED for each in possible)
+    if matched < len(possible) and (matched == 0 or knows_all):
         return Outcome.VIOLATED, reason
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
 

@@ -9,7 +9,6 @@ keep, and its packet error rate (TS 23.501 Table 5.7.4-1, clause 5.7.3.4).
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
@@ -35,7 +34,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, brings_up
+from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, Whose, brings_up
 
 PROBATION_S = 10.0
 """What can be decided at all in a system that was brought up is waited for this long."""
@@ -381,11 +380,11 @@ def _counted(view: View) -> list[_Counted]:
     for flow in view.flows:
         arriving.setdefault((flow.planned.topic, flow.subscription), []).append(flow)
     found = []
-    seen = (*view.seen, *view.seen_of_tools)
-    publishers = Counter(each.name for each in seen if each.kind is EndpointKind.PUBLISHER)
     for (topic, _), flows in arriving.items():
         reader = flows[0].reader
         numbers = reader.planned.quantities if reader else ()
+        seen, _ = view.topics.get(topic, ((), ()))
+        publishers = sum(each.whose is not Whose.DEPARTED for each in seen)
         sample = _sample(view, flows[0])
         there = [each for each in flows if not is_missing(each)]
         active = [each for each in there if _is_active(view, each)]
@@ -397,7 +396,7 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max(len(flows), publishers[topic]),
+                several=max(len(flows), publishers),
                 publish_s=() if None in times else publish_s,
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),

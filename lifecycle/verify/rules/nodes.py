@@ -10,7 +10,7 @@ from lifecycle.plan.model import PlannedProcess
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import View, brings_up, is_beyond
+from lifecycle.verify.view import View, Whose, brings_up, is_beyond
 
 MISSING_NODE = Rule(
     id="graph.missing-node",
@@ -149,7 +149,7 @@ def _duplicate(view: View) -> Iterator[Finding]:
 
 def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     owned: dict[str, list[str]] = {}
-    for endpoint in view.foreign:
+    for endpoint in view.of(Whose.FOREIGN):
         owned.setdefault(endpoint.node, []).append(f"{endpoint.kind.noun} of {endpoint.name}")
     undeclared = {name for name in view.observed if name not in view.planned} | set(owned)
     for name in sorted(undeclared):

@@ -14,12 +14,12 @@ from lifecycle.manifest.parameter_values import NOT_FINITE, is_implicit
 from lifecycle.plan.model import ExpectedParameter, PlannedNode, uses_sim_time
 from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN
 from lifecycle.printable import listed
-from lifecycle.verify.observation import SERVES_NONE, ObservedEndpoint, ParameterReport
+from lifecycle.verify.observation import SERVES_NONE, ParameterReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.tool_filter import CLOCK
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import NodeFacts, View
+from lifecycle.verify.view import NodeFacts, SeenEndpoint, View, Whose
 
 MISSING = Rule(
     id="param.missing",
@@ -340,11 +340,11 @@ def _time(view: View) -> Iterator[Finding]:
     if not users:
         return
     topic, type_ = CLOCK
+    ends, _ = view.topics.get(topic, ((), ()))
     publishers = [
         each
-        for group in view.groups.values()
-        for each in group
-        if (each.kind, each.name, each.type) == (EndpointKind.PUBLISHER, topic, type_)
+        for each in ends
+        if each.type == type_ and each.is_shown and each.whose is not Whose.DEPARTED
     ]
     if len(publishers) > 1:
         owners = ", ".join(sorted(each.node or "an unknown node" for each in publishers))
@@ -365,16 +365,17 @@ def _time(view: View) -> Iterator[Finding]:
         yield from _of_one(view, users, publishers[0])
 
 
-def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -> Iterator[Finding]:
+def _of_one(view: View, users: list[PlannedNode], publisher: SeenEndpoint) -> Iterator[Finding]:
     who = publisher.node or "an unknown node"
-    if (publisher.node, publisher.kind, publisher.name) not in view.names.ends:
+    if publisher.planned is None:
         yield UNDECLARED_CLOCK.finding(
             **_place(users),
             expected="declared publisher",
             observed=f"the publisher of {publisher.name} in {who}",
         )
     # A managed publisher sends once it is active.
-    if publisher.silent and view.stage is Stage.ACTIVE:
+    seen = publisher.observed
+    if seen is not None and seen.silent and view.stage is Stage.ACTIVE:
         yield SILENT_CLOCK.finding(
             **_place(users),
             expected="time",

@@ -60,11 +60,8 @@ def check(view: View) -> Iterator[Finding]:
     """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
     for facts in view.nodes.values():
         yield from _of_node(facts)
-    topics: dict[str, list[SeenEndpoint]] = {}
-    for each in view.seen:
-        topics.setdefault(each.name, []).append(each)
-    for name in sorted(topics):
-        yield from _pairs(view, topics[name])
+    for name in sorted(view.topics):
+        yield from _pairs(view, *view.topics[name])
 
 
 def _of_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -159,16 +156,18 @@ def spell(profile: QosProfile, policy: str) -> str:
     return "infinite" if value in (None, 0, INFINITE_NS) else f"{value} ns"
 
 
-def _pairs(view: View, ends: list[SeenEndpoint]) -> Iterator[Finding]:
+def _pairs(
+    view: View, publishers: list[SeenEndpoint], subscriptions: list[SeenEndpoint]
+) -> Iterator[Finding]:
     """Every publisher against every subscription of a topic, at least one of them ours.
 
     Of an end that nobody observed there is no QoS to compare: its node is named as out of reach,
     and its flows are proven by those that count whom they are matched with.
     """
-    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER and each.is_shown]
-    subscriptions = [
-        each for each in ends if each.kind is not EndpointKind.PUBLISHER and each.is_shown
-    ]
+    publishers, subscriptions = (
+        [each for each in ends if each.is_shown and not each.is_passing]
+        for ends in (publishers, subscriptions)
+    )
     done: set[tuple[str, str, str, str, str]] = set()
     for publisher in publishers:
         for subscription in subscriptions:

@@ -313,8 +313,8 @@ def test_what_is_equal_of_other_topics_or_nodes_is_a_finding_of_its_own():
     assert [each[0] for each in incompatible(edit, plan)] == [
         "/a: /one → /two",
         "/a: /three → /two",
-        "/b: /one → /three",
         "/b: /one → /two",
+        "/b: /one → /three",
     ]
 
 

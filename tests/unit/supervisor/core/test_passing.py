@@ -287,7 +287,7 @@ def test_who_comes_again_and_is_not_what_was_verified_once_it_is_active_has_fail
     play.see(INTRUDER)
     play.finish("camera activate")
     play.wait(1.0)
-    text = "cannot keep '/camera' active: what became active is not what was verified; wrong: {}"
+    text = "cannot keep '/camera' active: what became active is not what was verified; {}"
     assert play.failures[-1] == ("/camera", text.format(STRANGER))
     assert [each.restarts for each in play.heard(RestartScheduled)] == [0, 1]
 

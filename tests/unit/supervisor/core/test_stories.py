@@ -261,7 +261,7 @@ def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
     ("lasts_s", "code", "why"),
     [
         (2.0, 4, "done, but violated meanwhile,"),
-        (0.2, 0, "done; violated for no longer than 1 s, and not counted"),
+        (0.2, 0, "done; violated for no longer than 1 s, and not counted:"),
         (20.0, 4, "done, but violated;"),
     ],
 )
