@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.node.callbacks import GoalInterruptedError
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
     from lifecycle.node.node import ERROR, FAILURE, SUCCESS, LifecycleNode, TransitionCallbackReturn
@@ -18,7 +17,6 @@ __all__ = [
     "ERROR",
     "FAILURE",
     "SUCCESS",
-    "GoalInterruptedError",
     "LifecycleNode",
     "TransitionCallbackReturn",
     "on_action",
@@ -32,7 +30,6 @@ __all__ = [
 _NODE = ("ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn")
 _HOME = {
     **dict.fromkeys(_NODE, "node"),
-    "GoalInterruptedError": "callbacks",
     "run": "host.standalone",
 }
 """Module of `lifecycle.node` that has a name; of others `handlers`."""

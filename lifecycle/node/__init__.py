@@ -1,4 +1,4 @@
 """LifecycleNode: the class to derive from, its state machine, and how it is run.
 
-Owns: the node's side of everything. The control channel's types need no ROS.
+Owns: the node's side of everything.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import os
@@ -21,30 +22,28 @@ from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
+from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
-    from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen
+    from lifecycle.programming.target import Program
     from lifecycle.supervisor.run.looking import JudgedSystem
 
 
-def export(
-    plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment | None
-) -> None:
+def export(plan: Plan, flows: Sequence[FlowReport], program: Program) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
         UsageError: it cannot be exported so.
     """
-    programmer = _open(plan, (network,), treatment)
+    programmer = _open(plan, program)
     try:
         text = programmer.export(flows)
     except ValueError as error:
-        raise UsageError(str(error), hint=network.target.hint) from error
+        raise UsageError(str(error), hint=program.targets[0].target.hint) from error
     click.echo(text, nl=False)
     _show_left_out(programmer.left_out)
 
@@ -98,14 +97,6 @@ def command() -> None:
     metavar="FILE",
     help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
 )
-@click.option(
-    "--for",
-    "for_s",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End --record after so long.",
-)
-@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @common.network_options(
     "--export",
@@ -120,31 +111,21 @@ def _show(
     format_: str,
     watch: bool,
     record: Path | None,
-    for_s: float | None,
-    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
     from lifecycle.supervisor.run import looking
 
-    if record is None and (force or for_s is not None):
-        raise UsageError("cannot use --for or --force without --record FILE")
     if record is not None and (watch or export_ is not None):
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
     if watch and export_ is not None:
         raise UsageError("cannot use --export with --watch; export once")
-    if export_ is not None:
-        # What is exported for a network takes what programming it takes.
-        (network,), treatment = common.read_networks((export_,), rest, option="--export")
-    elif any(rest.values()):
-        raise UsageError(
-            "cannot say how to treat flows that are only shown",
-            hint="give --export, or use lifecycle flows apply",
-        )
+    # What is exported for a network takes what programming it takes.
+    program = common.read_networks((export_,) if export_ else (), rest, option="--export")
     plan = _plan_of(target, assignments)
     if record is not None:
-        return _record(plan, Record(record, replaces=force), for_s)
+        return _record(plan, Record(record))
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
@@ -156,8 +137,8 @@ def _show(
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         common.say(each)
-    if export_ is not None:
-        export(seen.plan, seen.verdict.flows, network, treatment)
+    if program is not None:
+        export(seen.plan, seen.verdict.flows, program)
     else:
         flows, measured = seen.verdict.flows, seen.verdict.measured
         click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
@@ -175,7 +156,7 @@ def _measuring(plan: Plan) -> Path | None:
 
 
 def _watch(plan: Plan, format_: str) -> int:
-    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
@@ -186,7 +167,7 @@ def _watch(plan: Plan, format_: str) -> int:
             )
             return ExitCode.OK
         with common.asking(path):
-            for seen in follow(path / "control"):
+            for seen in follow(path):
                 if seen.verdict is not None:
                     show(watched_flows(seen.verdict, format_))
     common.say(f"{path.name}: its supervisor has ended")
@@ -197,34 +178,27 @@ _EACH_S = 1.0
 """What is measured changes so often."""
 
 
-def _record(plan: Plan, record: Record, for_s: float | None) -> int:
-    """Write what is measured each second, until it is over or the supervisor ends."""
+def _record(plan: Plan, record: Record) -> int:
+    """Write what is measured each second, until it is interrupted or the supervisor ends."""
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
     with contextlib.closing(record):
         try:
             if path is not None:
-                _record_supervised(path, record, for_s)
+                _record_supervised(path, record)
             else:
-                follow_running(
-                    plan,
-                    lambda seen: record.add(seen.verdict.measured),
-                    each_s=_EACH_S,
-                    for_s=for_s,
-                )
+                follow_running(plan, lambda seen: record.add(seen.verdict.measured), each_s=_EACH_S)
         finally:
             common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
     return ExitCode.OK
 
 
-def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
+def _record_supervised(path: Path, record: Record) -> None:
     from lifecycle.supervisor.control.protocol import status
 
     began_s = time.monotonic()
     for number in itertools.count():
-        if for_s is not None and number * _EACH_S >= for_s:
-            return
         time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
         try:
             measured = status(path).measured
@@ -249,14 +223,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
         return look(path).plan
 
 
-def apply(
-    plan: Plan,
-    flows: Sequence[FlowReport],
-    options: Sequence[Chosen],
-    *,
-    dry_run: bool,
-    treatment: Treatment | None = None,
-) -> bool:
+def apply(plan: Plan, flows: Sequence[FlowReport], program: Program, *, dry_run: bool) -> bool:
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
@@ -266,9 +233,9 @@ def apply(
     """
     from lifecycle.programming.target import PartlyError
 
-    programmer = _open(plan, options, treatment)
+    programmer = _open(plan, program)
     try:
-        changes = programmer.diff(flows) if dry_run else programmer.update(flows)
+        changes = asyncio.run(programmer.diff(flows) if dry_run else programmer.update(flows))
     except PartlyError as error:
         if error.done:
             path = shlex.quote(plan.manifest_path)
@@ -282,7 +249,10 @@ def apply(
 
 def remove(plan: Plan) -> int:
     """Remove everything of the system from every network that it was applied to."""
-    changes = _open(plan, ()).close()
+    from lifecycle.programming.programmer import remove_programmed
+
+    directory = runtime_root(os.environ) / run_name(plan, "")
+    changes = asyncio.run(remove_programmed(directory))
     for each in changes:
         click.echo(each.render(done=True))
     if not changes:
@@ -314,8 +284,8 @@ def _apply(
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    options, treatment = common.read_networks(targets, rest, option="--target")
-    if not options:
+    program = common.read_networks(targets, rest, option="--target")
+    if program is None:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
@@ -325,7 +295,7 @@ def _apply(
     for each in seen.notices:
         common.say(each)
     flows = seen.verdict.flows
-    changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    changed = apply(seen.plan, flows, program, dry_run=dry_run)
     if changed and dry_run:
         return ExitCode.VIOLATED
     if changed and plan.bounds:
@@ -375,10 +345,10 @@ def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     return remove(common.load_plan(manifest, assignments))
 
 
-def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
+def _open(plan: Plan, program: Program) -> Programmer:
     from lifecycle.programming.programmer import open_programmer
 
-    return open_programmer(plan, options, environment=os.environ, treatment=treatment)
+    return open_programmer(plan, program, environment=os.environ)
 
 
 def _show_left_out(flows: Iterable[str]) -> None:
