@@ -26,7 +26,7 @@ from lifecycle.manifest.names import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan, uses_sim_time
-from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
+from lifecycle.verify.observation import ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"
 """Observers: every supervisor and every `lifecycle verify` has one. They are tolerated as tools,
@@ -395,44 +395,6 @@ def _action_hash(*parts: ObservedEndpoint) -> str | None:
     """Return the type hash of an action from those of its parts; None while one is not seen."""
     known = [each.type_hash for each in parts if each.type_hash is not None]
     return join(known) if len(known) == len(parts) else None
-
-
-class Owner(msgspec.Struct, frozen=True):
-    """Whose a hidden node is, as that node itself reports.
-
-    Attributes:
-        node: full name of the planned node that has it.
-        prefixes: GUID prefixes of the participants that the owner reports, 24 hex digits each: what
-            has another one is not the owner's, whatever its node is called.
-    """
-
-    node: str
-    prefixes: frozenset[str]
-
-    def has(self, endpoint: ObservedEndpoint) -> bool:
-        """Return whether an endpoint of the hidden node is the owner's, as far as its GID says."""
-        return not endpoint.gid or endpoint.gid[:PREFIX_DIGITS] in self.prefixes
-
-
-def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dict[str, Owner]:
-    """Return whose every hidden node of planned nodes is, by its full name.
-
-    A name proves nothing: any process can call a node `_camera_flow_0`. Only the node that has it
-    can say so, and on which participant it is.
-    """
-    found: dict[str, Owner] = {}
-    for each in reported:
-        hidden = {one.node_name for one in each.connections}
-        hidden |= {one.participant for one in each.endpoints}
-        hidden -= {""}
-        if each.name not in nodes or not hidden:
-            continue
-        prefixes = {one.prefix for one in each.connections}
-        prefixes |= {one.gid[:PREFIX_DIGITS] for one in each.endpoints}
-        owner = Owner(each.name, frozenset(prefixes - {""}))
-        namespace = each.name.rpartition("/")[0]
-        found |= {f"{namespace}/{name}": owner for name in hidden}
-    return found
 
 
 def is_hidden_node(full_name: str) -> bool:
