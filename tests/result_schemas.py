@@ -38,12 +38,10 @@ _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE
 
 
 def _verdict(schema: _Schema) -> None:
-    """A verdict is written without what is empty, see `lifecycle.verify.report.to_json`."""
-    del schema["properties"]["blocking"], schema["$defs"]["Finding"]["properties"]["ends"]
+    """A verdict is written without what is as it mostly is."""
     schema["properties"]["judged"] |= {"const": False}
     run = schema["properties"]["run"]
     run |= run.pop("anyOf")[0]
-    schema["required"].remove("blocking")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

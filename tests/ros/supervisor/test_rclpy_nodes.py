@@ -129,7 +129,7 @@ def test_a_plain_node_does_nothing_while_the_gate_is_closed(
     with running.up(manifest, "--timeout", "2", runtime=tmp_path) as up:
         assert up.finish() == 4
         assert [each["message"] for each in up.verdict["findings"]] == [
-            "/talker has no publisher of /shouts, which is declared"
+            "the publisher of /shouts in /talker is declared, and is not there"
         ]
         assert "heard" not in log_of(up, "listener")
         assert "/words is dropped" in log_of(up, "talker").replace("'", "").replace(
