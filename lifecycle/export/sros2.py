@@ -133,8 +133,8 @@ def _node_profile(node: PlannedNode) -> Profile:
         (EndpointKind.SUBSCRIPTION, "/clock"),
     }
     if node.managed:
-        allowed |= {(EndpointKind.PUBLISHER, each) for each in _node_topics(node)}
         allowed |= {
+            (EndpointKind.PUBLISHER, f"{node.full_name}/transition_event"),
             (EndpointKind.PUBLISHER, GRAPH_TOPIC),
             (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
         }
@@ -157,7 +157,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
             names -= MANAGED_SERVICES
         allowed |= {(EndpointKind.SERVICE_CLIENT, f"{node.full_name}/{name}") for name in names}
         if node.managed:
-            allowed |= {(EndpointKind.SUBSCRIPTION, each) for each in _node_topics(node)}
+            allowed.add((EndpointKind.SUBSCRIPTION, f"{node.full_name}/transition_event"))
     for other in plan.machines:
         kind = EndpointKind.PUBLISHER if other.name == machine else EndpointKind.SUBSCRIPTION
         allowed.add((kind, supervisor_alive_topic(plan.system, other.name)))
@@ -166,10 +166,6 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(plan, machine if several else "")
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
-
-
-def _node_topics(node: PlannedNode) -> tuple[str, ...]:
-    return tuple(f"{node.full_name}/{name}" for name in ("transition_event", "_alive"))
 
 
 def _path(system: str, name: str) -> str:

@@ -375,11 +375,6 @@ def supervisor_alive_topic(system: str, machine: str) -> str:
     return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
 
 
-def node_alive_topic(full_name: str) -> str:
-    """Return the hidden topic on which a node without a supervisor asserts its liveliness."""
-    return f"{full_name}/_alive"
-
-
 def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names, below its prefix, of a supervisor's services; of those for modes, too."""
     if access is RosInterfaceAccess.OFF:

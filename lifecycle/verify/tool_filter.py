@@ -75,7 +75,6 @@ OURS_BY = frozenset({"get_configuration", "map_to"})
 """Who offers both under its own name is a node of ours."""
 
 NODE_TOPICS: Mapping[str, str] = {
-    "_alive": "std_msgs/msg/String",
     "transition_event": "lifecycle_msgs/msg/TransitionEvent",
 }
 """Topics that a node publishes under its own name, and their types."""

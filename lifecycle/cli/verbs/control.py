@@ -193,12 +193,12 @@ def status_command(
 
 def _watch(path: Path, format_: str) -> int:
     from lifecycle.cli.standard_streams import watched
-    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.verify.outcome import Outcome
 
     verdict, is_json = None, format_ == "json"
     with watched(whole=not is_json) as show, common.asking(path):
-        for seen in follow(path / "control"):
+        for seen in follow(path):
             status, verdict = seen.status, seen.status.verdict
             if is_json:
                 show(common.json_of(status))

@@ -171,7 +171,7 @@ def _follow(plan: Plan, take: Callable[[Verdict], None]) -> str:
 
     Where no supervisor of this host measures, it is looked from outside until interrupted.
     """
-    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
@@ -179,7 +179,7 @@ def _follow(plan: Plan, take: Callable[[Verdict], None]) -> str:
         follow_running(plan, lambda seen: take(seen.verdict), each_s=_EACH_S)
         return "nothing more to see"
     with common.asking(path):
-        for seen in follow(path / "control"):
+        for seen in follow(path):
             if seen.verdict is not None:
                 take(seen.verdict)
     return f"{path.name}: its supervisor has ended"

@@ -1,91 +1,23 @@
-"""Run one node in a terminal, without a supervisor: with a manifest's part of a plan, or without.
-
-A supervisor that attaches to it learns by DDS that its process runs, and from a thread of it that
-its executor hangs, unless a callback holds the lock of the interpreter.
-"""
+"""Run one node in a terminal, with a manifest's part of a plan, or without; no supervisor."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
-import threading
-import time
 import traceback
-import typing
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Run, RunKind, Timeouts
-from lifecycle.manifest.names import node_alive_topic
+from lifecycle.manifest.model import Run, RunKind
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
-from lifecycle.middleware.process.busy_sign import BusySign, Overdue, brief
-from lifecycle.middleware.services.supervisor_topics import AliveNotice, AlivePublisher
 from lifecycle.node.callbacks import CallbackOutcome
 from lifecycle.node.host.adoption import Adoption, Hosted, initialised
 from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.managed import Managed
 from lifecycle.node.planned import is_auto
 from lifecycle.plan.model import PlannedNode
-
-_REPEATED_AFTER_S = (0.1, 0.3)
-"""Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
-
-
-@typing.final
-class OwnLiveliness:
-    """The liveliness of one process without a supervisor; its sign is for what spins the node."""
-
-    def __init__(self, limit_s: float) -> None:
-        self.sign = BusySign.make(limit_s)
-        self.sign.show_stacks()
-        self._lock = threading.Lock()
-        self._silent: dict[str, str] = {}
-        self._publisher: AlivePublisher | None = None
-        self._name = ""
-
-    def open(self, hosted: Managed, republish_names: Callable[[], None]) -> None:
-        """Assert its liveliness from now on; a subscriber that is matched may have lost names."""
-        self._name = hosted.full_name
-        self._publisher = AlivePublisher(
-            hosted.node, node_alive_topic(self._name), on_listener=republish_names
-        )
-        threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
-
-    def _watch(self) -> None:
-        while True:
-            why, again_s = self.sign.look()
-            if why is Overdue.HANGS:
-                what = f" {self.sign.what}" if self.sign.what else ""
-                where = brief(self.sign.where(os.getpid()))
-                self.announce(
-                    f"a callback{what} in its process (pid {os.getpid()}) has been running for "
-                    f"more than {self.sign.limit_s:g} s{where and f', in {where}'}"
-                )
-            elif why is Overdue.UNSERVED:
-                self.announce(
-                    f"its process (pid {os.getpid()}) gets no processor for its callback: the "
-                    "machine is overloaded"
-                )
-            time.sleep(again_s)
-
-    def announce(self, why: str) -> None:
-        """Say why it is silent, or that it is not any more."""
-        silent = self._silent = {self._name: why} if why else {}
-
-        def publish() -> None:
-            with self._lock:
-                # Only what still holds is said again.
-                if silent is self._silent and self._publisher is not None:
-                    self._publisher.notify(AliveNotice(silent=silent))
-
-        publish()
-        for after_s in _REPEATED_AFTER_S:
-            timer = threading.Timer(after_s, publish)
-            timer.daemon = True
-            timer.start()
 
 
 def report(line: str) -> None:
@@ -128,15 +60,7 @@ def run(
     settings = ParticipantSettings() if spec is None else ParticipantSettings.of(spec)
     context = initialised(settings, domain_id, args=sys.argv if arguments is None else arguments)
     planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
-    limit_s = (spec.timeouts if spec is not None else Timeouts()).silent_s
-    liveliness = OwnLiveliness(limit_s)
-    loop = NodeLoop(
-        context,
-        liveliness.sign,
-        lambda _: liveliness.announce(""),
-        executor=planned.executor,
-        threads=planned.threads,
-    )
+    loop = NodeLoop(context, executor=planned.executor, threads=planned.threads)
 
     def end(number: signal.Signals) -> None:
         say(f"{number.name}: shutting down")
@@ -151,8 +75,6 @@ def run(
             (hosted,) = adoption.make(spec, [spec], node_class)
         name = hosted.full_name
         loop.add(hosted)
-        if isinstance(hosted, Managed):
-            liveliness.open(hosted, loop.republish_names)
         hosted.listeners.append(lambda _: say(f"{name}: {_state(hosted)}"))
         say(f"{name}: {_state(hosted)}")
         if lifecycle is None:

@@ -56,7 +56,6 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         if node.name in (flow.publisher, flow.subscription)
     ]
     matches = _matches(node, configuration, flows)
-    cpu_s, rss_bytes, threads = _use(process.pid) if runs and process is not None else (None,) * 3
     external = node.planned.run.kind is RunKind.ATTACH
     last = None if known is None or not known.failures else known.failures[-1]
     if last is not None:
@@ -93,23 +92,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         restarts=0 if known is None else known.restarts,
         last_failure=last,
         next_try_s=due_s if known is not None and known.failed and due_s > 0 else None,
-        cpu_s=cpu_s,
-        rss_bytes=rss_bytes,
-        threads=threads,
     )
-
-
-def _use(pid: int) -> tuple[float | None, int | None, int | None]:
-    """Return what a process uses: CPU time, seconds, resident bytes and threads; or nothing."""
-    import psutil  # 15 ms, which no bring-up has to wait for
-
-    try:
-        process = psutil.Process(pid)
-        with process.oneshot():
-            times = process.cpu_times()
-            return times.user + times.system, process.memory_info().rss, process.num_threads()
-    except psutil.Error:
-        return None, None, None
 
 
 def _state(node: NodeRun, verdict: Verdict | None) -> str:
@@ -157,7 +140,7 @@ def _died(run: Run, process: Process | None, pid: int) -> str:
 
 
 def system_status(system: System) -> SystemStatus:
-    """Return what is known of the whole system, with what its processes use now."""
+    """Return what is known of the whole system."""
     run, elapsed_s = system.run, system.emit.elapsed_s
     verdict = run.judged.verdict
     return SystemStatus(

@@ -1,4 +1,4 @@
-"""The other supervisors of a system, and the nodes that it attaches to: alive, lost, left, agreed.
+"""The other supervisors of a system: alive, lost, left, agreed.
 
 Owns: `Peers`: announcing ourselves and our plan, noticing who is found, lost or shut down, what
 they report of silent nodes, comparing clocks and plans, and marks that arrive. A manifest with
@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import DiscoveryRange, RunKind
-from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.manifest.names import supervisor_alive_topic
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.node.host.control import Operation
@@ -78,11 +78,10 @@ _logger = logging.getLogger(__name__)
 
 
 class _Peer(msgspec.Struct):
-    """A supervisor or an attached node that should be alive.
+    """A supervisor that should be alive.
 
     Attributes:
-        what: for messages, "the supervisor of machine 'robot'".
-        machine: empty for an attached node, which has nothing of what comes after `lost_at_s`.
+        machine: whose it is.
         nodes: fully qualified names of the nodes that are lost with it.
         watch: None once it is not followed any more.
         lost_at_s: when it was lost; None while it is not.
@@ -92,7 +91,6 @@ class _Peer(msgspec.Struct):
         unknown_since_s: since when it is there, and has not said its plan.
     """
 
-    what: str
     machine: str
     nodes: tuple[str, ...]
     watch: AliveSubscription | None = None
@@ -102,6 +100,11 @@ class _Peer(msgspec.Struct):
     clock: ClockComparison = msgspec.field(default_factory=ClockComparison)
     answered: int | None = None
     unknown_since_s: float | None = None
+
+    @property
+    def what(self) -> str:
+        """For messages."""
+        return f"the supervisor of machine {self.machine!r}"
 
 
 class Peers:
@@ -114,7 +117,6 @@ class Peers:
         machines = dict.fromkeys(each.planned.machine for each in system.nodes.values())
         self._own = tuple(filter(None, machines))
         self._supervisors: list[_Peer] = []
-        self._attached: dict[str, _Peer] = {}
         self._announcements: list[AlivePublisher] = []
         self._silent: Mapping[str, str] = {}
         self._asks = self._awaited = 0
@@ -133,10 +135,7 @@ class Peers:
         remote = self._system.remote.values()
         for machine in filter(None, dict.fromkeys(each.machine for each in remote)):
             nodes = (each.full_name for each in remote if each.machine == machine)
-            what = f"the supervisor of machine {machine!r}"
-            topic = supervisor_alive_topic(system, machine)
-            self._supervisors.append(self._watch(topic, what, machine, nodes))
-        self.renew()
+            self._supervisors.append(self._watch(_Peer(machine, tuple(nodes))))
         if remote:
             self._announcements = [
                 self._participant.announce_alive(
@@ -148,23 +147,6 @@ class Peers:
         if remote or plan.discovery_range not in (DiscoveryRange.LOCALHOST, DiscoveryRange.OFF):
             self._notices = self._participant.plan_notices(self._in_loop(self._take))
             self.announce()
-
-    def renew(self) -> None:
-        """Follow the attached nodes of the plan as it is now."""
-        names = [
-            node.name
-            for node in self._system.nodes.values()
-            if node.planned.run.kind is RunKind.ATTACH
-        ]
-        for name in self._attached.keys() - names:
-            peer = self._attached.pop(name)
-            _forget(peer)
-            for cause in (Cause.LOST, Cause.REPORTED):
-                self._system.liveliness.note(peer.nodes, cause, "")
-        for name in names:
-            if name not in self._attached:
-                peer = self._watch(node_alive_topic(name), repr(name), "", [name])
-                self._attached[name] = peer
 
     def announce(self) -> None:
         """Say what we plan from now on."""
@@ -189,8 +171,10 @@ class Peers:
             self._notices.destroy()
             self._notices = None
         self._marks.close()
-        for peer in (*self._supervisors, *self._attached.values()):
-            _forget(peer)
+        for peer in self._supervisors:
+            if peer.watch is not None:
+                peer.watch.destroy()
+                peer.watch = None
         for announcement in self._announcements:
             announcement.destroy()
         self._announcements.clear()
@@ -206,18 +190,16 @@ class Peers:
 
     # Who is alive
 
-    def _watch(self, topic: str, what: str, machine: str, nodes: Iterable[str]) -> _Peer:
-        peer = _Peer(what, machine, tuple(nodes))
-
+    def _watch(self, peer: _Peer) -> _Peer:
         def calls(do: Callable[..., None]) -> Callable[..., None]:
             def unless_forgotten(*arguments: object) -> None:
-                if peer.watch is not None:  # else this was on its way
+                if peer.watch is not None:  # else this was on its way as it was closed
                     do(peer, *arguments)
 
             return self._in_loop(unless_forgotten)
 
         peer.watch = self._participant.watch_alive(
-            topic,
+            supervisor_alive_topic(self._system.plan.system, peer.machine),
             on_liveliness=calls(self._alive),
             on_left=calls(self._left),
             on_notice=calls(self._noticed),
@@ -237,10 +219,9 @@ class Peers:
             # DDS may have forgotten the node names of participants that it lost for long.
             self._participant.republish_names()
             self._system.have_hosts(Operation.REPUBLISH_NAMES)
-        if peer.machine:
-            self._system.emit(
-                MachineConnection(machine=peer.machine, established=is_alive, lost_s=lost_s)
-            )
+        self._system.emit(
+            MachineConnection(machine=peer.machine, established=is_alive, lost_s=lost_s)
+        )
         why = "" if is_alive else f"{peer.what} is not heard any more"
         self._system.liveliness.note(peer.nodes, Cause.LOST, why)
 
@@ -249,13 +230,11 @@ class Peers:
         if not peer.alive:
             return
         peer.alive = False
-        if peer.machine:
-            self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
+        self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
         self._system.liveliness.note(peer.nodes, Cause.REPORTED, "")
 
     def _noticed(self, peer: _Peer, notice: AliveNotice, sent_ns: int, received_ns: int) -> None:
-        if peer.machine:
-            self._compare(peer, notice, sent_ns, received_ns)
+        self._compare(peer, notice, sent_ns, received_ns)
         for name in peer.nodes:
             self._system.liveliness.note((name,), Cause.REPORTED, notice.silent.get(name, ""))
 
@@ -471,9 +450,3 @@ class Peers:
             or (each.system != self._system.plan.system and {*peer.nodes} & {*each.nodes})
             for each in self._known
         )
-
-
-def _forget(peer: _Peer) -> None:
-    if peer.watch is not None:
-        peer.watch.destroy()
-        peer.watch = None

@@ -6,8 +6,6 @@ import contextlib
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb, write
+from tests.ros.supervisor.running import Event, Up, up, verb, write
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = pytest.mark.thorough
@@ -254,43 +252,3 @@ def test_nodes_join_and_leave_the_graph_as_events(start: Callable[..., Up]) -> N
     assert sorted(joined(running)) == ["/hanging", "/quiet"]
     os.kill(running.pid_of("quiet"), signal.SIGTERM)
     running.until("left", node="/quiet")
-
-
-@pytest.mark.alone
-def test_a_node_that_somebody_else_runs_is_heard_by_whoever_attaches_to_it(
-    start: Callable[..., Up], tmp_path: Path, stalls: Stalls
-) -> None:
-    code = f"import lifecycle, {NODES} as nodes; lifecycle.run(nodes.Hanging)"
-    node = subprocess.Popen(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env={**environment(tmp_path, ""), "HANG_FILE": str(tmp_path / "hang")},
-        stdout=subprocess.DEVNULL,
-    )
-    try:
-        running = start(hanging={"attach": True})
-        running.until("system", reached="active")
-        hang(tmp_path, "sleep")
-        running.until("silent", node="/hanging", cause="told")
-        running.until("alive", node="/hanging")
-
-        def late_s() -> float:
-            began = time.monotonic()
-            node.send_signal(signal.SIGSTOP)
-            silent = at(running, "silent", node="/hanging", cause="lost")
-            ended = time.monotonic()
-            node.send_signal(signal.SIGCONT)
-            alive = at(running, "alive", node="/hanging")
-            return max(stalls.taken(began, silent), stalls.taken(ended, alive)) - limit_s
-
-        limit_s = WITHIN_S + BUSY_MACHINE_S
-        assert_in_time(late_s)
-        began, since = time.monotonic(), len(running.events)
-        node.kill()
-        # Not by an event: that its callback lasted while it was stopped may have come before.
-        running.until_verdict(lambda verdict: "lost" in _silent_by(verdict), since=since)
-        # A process dies once, so there is no second try.
-        assert stalls.taken(began, time.monotonic()) <= 2 * limit_s
-    finally:
-        node.kill()
-        node.wait(10)

@@ -13,7 +13,7 @@ from lifecycle.cli import cli
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import PLANS_TOPIC, enclaves_of, render_policy
 from lifecycle.manifest.loading import load
-from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.manifest.names import supervisor_alive_topic
 from lifecycle.middleware.services import supervisor_topics
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
@@ -163,7 +163,6 @@ def test_names_of_topics_are_those_that_the_middleware_uses(tmp_path: Path) -> N
     assert PLANS_TOPIC == supervisor_topics.PLANS_TOPIC
     assert mine in allowed(policy, here, "publish")
     assert others in allowed(policy, here, "subscribe")
-    assert node_alive_topic("/dock") in allowed(policy, here, "subscribe")
 
 
 def test_a_process_named_as_a_supervisor_keeps_an_enclave_of_its_own(tmp_path: Path) -> None:

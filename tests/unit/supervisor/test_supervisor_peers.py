@@ -1,4 +1,4 @@
-"""Other supervisors and attached nodes: lost, found, shut down, and what they planned."""
+"""Other supervisors: lost, found, shut down, and what they planned."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import DiscoveryRange, Machine, Quantity, Run, RunKind
-from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.manifest.model import DiscoveryRange, Machine, Quantity, RunKind
+from lifecycle.manifest.names import supervisor_alive_topic
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.comparison import decode, encode, notice_of
 from lifecycle.plan.model import Plan, PlannedFlow
-from lifecycle.supervisor.core.state import install
 from lifecycle.supervisor.nodes.liveliness import Cause
 from lifecycle.supervisor.nodes.peers import ANNOUNCED_S, EXCHANGED_S, Peers
 from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -166,45 +165,6 @@ async def test_silence_is_said_again_and_again_and_that_of_others_is_taken_over(
     await asyncio.sleep(1)
     (said,) = robot.air.announced.values()
     assert said[-6:] == [{"/camera": "it hangs"}] * 3 + [{}] * 3
-
-
-def attached(*keys: str) -> Plan:
-    """A camera of ours, and nodes that others run."""
-    others = [replace(planned_node(each), run=Run(kind=RunKind.ATTACH)) for each in keys]
-    plan = plan_of(planned_node("camera"), *others)
-    return replace(plan, discovery_range=DiscoveryRange.LOCALHOST)
-
-
-async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(
-    tmp_path: Path,
-) -> None:
-    lidar, radar, sonar = map(node_alive_topic, ("/lidar", "/radar", "/sonar"))
-    robot = Robot(tmp_path, attached("lidar", "radar"))
-    air, silent = robot.air, robot.system.liveliness
-    # A system of one machine neither announces itself nor its plan.
-    assert (set(air.watched), air.announced, air.plans) == ({lidar, radar}, {}, [])
-    gone, kept = air.watched[lidar], air.watched[radar]
-    for each in (gone, kept):
-        each.alive(True)
-    await settle()
-    gone.alive(False)
-    await settle()
-    assert set(silent.silent) == {"/lidar"}
-
-    install(robot.system.run, attached("radar", "sonar"))
-    robot.system.follow()
-    robot.peers.renew()
-    assert set(air.watched) == {radar, sonar}
-    # One that is not planned any more is not missed, whatever was on the way.
-    gone.alive(True)
-    gone.alive(False)
-    await settle()
-    assert dict(silent.silent) == {}
-    kept.alive(False)
-    air.watched[sonar].alive(True)
-    air.watched[sonar].alive(False)
-    await settle()
-    assert set(silent.silent) == {"/radar", "/sonar"}
 
 
 @pytest.mark.parametrize("came_back", [True, False])

@@ -329,7 +329,6 @@ def started_again(attempt: int) -> list[str]:
         f"[notice] '/viewer' is started again on a fresh port: {why}; try {attempt} of 3",
         *VIEWER_DOWN,
         *("viewer start", "/viewer configure", "/viewer connect"),
-        f"[system] connected at {5 * attempt:.1f} s",
     ]
 
 
@@ -404,7 +403,7 @@ async def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_a
         "[backoff] camera in 1.0 s",
         "[verdict] active violated graph.missing-node /camera",
         *("camera start", "/camera configure", "/camera connect"),
-        *("[system] connected at 4.0 s", "[verdict] connected ok", "[system] verified at 4.0 s"),
+        *("[verdict] connected ok", "[system] verified at 4.0 s"),
         *("networks programmed (ok)", "[gate] ok: /camera", "/camera activate"),
         *("[system] active at 4.0 s", "[restarted] camera (1)", "[stopping] at 10.0 s: done"),
         *(*DOWN, *over(0)),
@@ -444,24 +443,6 @@ async def test_a_node_that_hangs_is_not_asked_and_is_ended_by_its_watchdog_unles
             process.on_stop(False)
     ends = ("camera SIGKILL", "[backoff] camera in 1.0 s")
     assert [each for each in world.story if each in ends] == [*ends]
-
-
-async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
-    tmp_path: Path,
-) -> None:
-    world = SessionWorld(CHAIN, tmp_path)
-    world.hosts.lingers_s = 2.0
-    async with world.running("[system] active"):
-        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
-        world.kill("viewer")
-    assert world.since("viewer start", 2) == [
-        *("viewer start", "/viewer configure", "/viewer connect", "[system] connected at 2.0 s"),
-        *("[system] verified at 2.0 s", "networks programmed (ok)", "[gate] ok: /viewer"),
-        *("/viewer activate", "[system] active at 2.0 s", "[failure] run.process-died /viewer"),
-        "[stopping] at 2.0 s: rolling back",
-        *("/camera deactivate", *CAMERA_DOWN, *over(6)),
-    ]
-    assert world.graph.dropped == ["/viewer"]
 
 
 async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
