@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,10 @@ from lifecycle.verify.observation import NodeConfiguration
 if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
     from lifecycle.node.gate import Later
+
+
+_UNSAID = ("undeclare_parameter", "set_descriptor")
+"""They change the parameters of a node, and rclpy notifies nobody."""
 
 
 class NodeInHost:
@@ -73,9 +78,22 @@ class NodeInHost:
         self.listeners: list[Callable[[Any], None]] = []
         self.log = node.get_logger()
         self.configuration_changes = ConfigurationChanges(later, collect, failed=self.log.error)
-        changed = self.configuration_changes.touch
-        node.add_post_set_parameters_callback(lambda _: changed())
+        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
+        for name in _UNSAID:
+            self._touch_after(name)
         self.found: dict[int, Endpoint] = {}
+
+    def _touch_after(self, name: str) -> None:
+        """Have a method of the node followed by a look at its configuration."""
+        method = getattr(self.node, name)
+
+        @functools.wraps(method)
+        def touching(*arguments: Any, **options: Any) -> Any:
+            result = method(*arguments, **options)
+            self.configuration_changes.touch()
+            return result
+
+        setattr(self.node, name, touching)
 
     def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
         """Note an endpoint that one of rclpy's factories returned."""
@@ -127,7 +145,6 @@ class Managed(NodeInHost):
         auto: bool,
         supervisor: str = "",
         *,
-        served: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
         self.turns = Turns(node)
@@ -135,15 +152,13 @@ class Managed(NodeInHost):
         self.auto = auto
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
-        self._publish: Callable[[Transition], None] = lambda _: None
         self._health = None if health is None else HealthCheck(self, health)
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self._machine = Machine(self, spec.timeouts)
-        if served:
-            self._publish = services.serve(node, self._machine, self.turns.group)
-            configuration.serve(node, self.get_configuration, self.turns.group)
-            serve_interface(node, acts_of(self.data_layer), self.turns.group)
+        self._publish = services.serve(node, self._machine, self.turns.group)
+        configuration.serve(node, self.get_configuration, self.turns.group)
+        serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
             self._join()
 
