@@ -194,6 +194,8 @@ class NodeLoop:
                 from rclpy.experimental.events_executor import EventsExecutor
 
                 self._own = EventsExecutor(context=context)
+                # With a single node it crashes where a task raises: it indexes its set of nodes.
+                self._own.add_node(Watching())
             else:
                 count = threads or max(2, os.cpu_count() or 0)
                 self._own = MultiThreadedExecutor(count, context=context)

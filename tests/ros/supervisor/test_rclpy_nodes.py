@@ -207,6 +207,18 @@ def test_an_events_executor_survives_that_endpoints_are_destroyed_while_peers_co
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("executor", ["single", "events"])
+def test_what_a_coroutine_raises_ends_the_process_with_its_traceback(
+    executor: str, fresh_domain: int, tmp_path: Path
+) -> None:
+    raising = node("Raising", managed=False, executor=executor)
+    manifest = running.write(tmp_path, fresh_domain, {"raising": raising})
+    with running.up(manifest, "--stop-after", "20", runtime=tmp_path) as up:
+        assert up.until("process", state="exited")["detail"] == "exit status 1"
+        assert "OSError: the sensor is on fire" in log_of(up, "raising")
+
+
+@pytest.mark.thorough
 def test_a_function_may_return_several_nodes_of_one_process(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
