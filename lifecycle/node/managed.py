@@ -53,6 +53,7 @@ class NodeInHost:
         listeners: are called with it after every change of state, whatever caused it.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories, by id of their object.
+        is_destroyed: its own code has destroyed it, in a process that goes on.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class NodeInHost:
         changed = self.configuration_changes.touch
         node.add_post_set_parameters_callback(lambda _: changed())
         self.found: dict[int, Endpoint] = {}
+        self.is_destroyed = False
 
     def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
         """Note an endpoint that one of rclpy's factories returned."""

@@ -198,6 +198,11 @@ class Adoption:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.close()
         destroy(node)
+        for hosted in self.made.values():
+            if hosted.node is node and not hosted.is_destroyed:
+                hosted.is_destroyed = True
+                for listener in hosted.listeners:
+                    listener(hosted)
 
     def _change_parameters(
         self, change: Callable[..., Any], node: Node, *arguments: Any, **options: Any

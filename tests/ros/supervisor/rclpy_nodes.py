@@ -68,6 +68,14 @@ class Raising(Node):
         raise OSError("the sensor is on fire")
 
 
+class Leaving(Node):
+    """Destroys itself a moment after it was released; its process goes on."""
+
+    def __init__(self) -> None:
+        super().__init__("leaving")
+        self.create_timer(0.2, self.destroy_node)
+
+
 class Listener(Node):
     """Prints what it hears."""
 
