@@ -194,6 +194,11 @@ class Adoption:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.close()
         destroy(node)
+        for hosted in self.made.values():
+            if hosted.node is node and not hosted.is_destroyed:
+                hosted.is_destroyed = True
+                for listener in hosted.listeners:
+                    listener(hosted)
 
     def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
         self._loop.take_waitable(node, waitable)  # before its executor can look

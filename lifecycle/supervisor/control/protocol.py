@@ -107,8 +107,8 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         flows: flows from or to it.
         findings: findings of the last verdict that concern it.
         silent: why nothing can be expected of it; empty while it is alive.
-        died: how its process ended unasked; empty while it runs. It then has no state, and no
-            matches.
+        died: how its process ended unasked, or that its own code destroyed it while that runs;
+            empty otherwise. It then has no state, and no matches.
         connections: as it reports them, its own participant left out.
         uptime_s: since its process was started; None while there is none of ours.
         restarts: how often its process was started again by policy.
