@@ -258,7 +258,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        observers=_by_machine(own.with_tcp, hosts),
+        observers=_by_machine(own, hosts),
     )
     variables = dict(variables_of(plan))
     parties = {
