@@ -24,7 +24,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 import msgspec
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.network.medium import SCHEMES, Medium, udp_to
+from lifecycle.network.medium import CONNECTABLE, Medium, udp_to
 from lifecycle.network.nfe import is_wildcard
 
 
@@ -73,8 +73,8 @@ def _peer(name: str, value: str) -> Peer:
     return Peer(address=address, port=port)
 
 
-_UDP = frozenset(each for each in SCHEMES if each.is_udp)
-_IP = frozenset(each for each in SCHEMES if each.is_network)
+_UDP = frozenset(each for each in CONNECTABLE if each.is_udp)
+_IP = frozenset(each for each in CONNECTABLE if each.is_network)
 
 
 class Option(NamedTuple):
@@ -244,11 +244,11 @@ def _parsed(text: str) -> ConnectionUrl:
         raise ConnectionUrlError(bad, hint=_HOW) from error
     # urlsplit takes no scheme with an underscore (RFC 3986 §3.1), `zmq_pgm` of the article.
     scheme = parts.scheme or (text.partition("://")[0] if "://" in text else "")
-    transport = next((each for each in SCHEMES if each == scheme), None)
+    transport = next((each for each in CONNECTABLE if each == scheme), None)
     if transport is None:
         raise ConnectionUrlError(
-            f"unknown transport {scheme!r}; allowed: {', '.join(SCHEMES)}",
-            hint=did_you_mean(scheme, SCHEMES) or _HOW,
+            f"unknown transport {scheme!r}; allowed: {', '.join(CONNECTABLE)}",
+            hint=did_you_mean(scheme, CONNECTABLE) or _HOW,
         )
     if parts.path not in ("", "/") or parts.fragment or parts.username or parts.password:
         raise ConnectionUrlError("only address, port and options are allowed", hint=_HOW)

@@ -61,11 +61,6 @@ class Medium(str, enum.Enum):
         return self.is_group or not self.is_network
 
     @property
-    def connects(self) -> bool:
-        """Whether connections are made of it, and connection URLs have it as their scheme."""
-        return self not in (Medium.TCPV6, Medium.INTRAPROCESS)
-
-    @property
     def ip_version(self) -> int | None:
         """4 or 6; None where it is either, or no IP."""
         return {"v4": 4, "v6": 6}.get(self.value[-2:])
@@ -124,15 +119,9 @@ LOOPBACK6 = "::1"
 NETWORK_MEDIA = frozenset(each for each in Medium if each.is_network)
 """Media whose packets a network sees."""
 
-CONNECTABLE = tuple(
-    sorted(
-        (each for each in Medium if each.connects), key=lambda each: (each.is_tcp, each.is_group)
-    )
-)
-"""Media that connections are made of, in the order in which a node reports them."""
-
-SCHEMES = tuple(sorted(CONNECTABLE, key=lambda each: not each.is_network))
-"""The same, in the order in which the schemes of connection URLs are listed."""
+CONNECTABLE = (Medium.SHM, Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4)
+"""Media that connections are made of, and schemes of connection URLs, in the order in which a node
+reports them."""
 
 UDP_UNICAST = tuple(each for each in CONNECTABLE if each.is_udp and not each.is_group)
 """By what participants are probed, and found without a discovery server."""

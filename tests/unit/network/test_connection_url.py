@@ -83,15 +83,15 @@ def test_an_ipv6_peer_without_a_port_needs_no_brackets():
     [
         (
             "udp4://10.77.0.1",
-            "unknown transport 'udp4'; allowed: udpv4, udpv6, udpm, tcpv4, shm",
+            "unknown transport 'udp4'; allowed: shm, udpv4, udpv6, udpm, tcpv4",
             "did you mean 'udpv4'?",
         ),
         (
             "http://10.77.0.1",
-            "unknown transport 'http'; allowed: udpv4, udpv6, udpm, tcpv4, shm",
+            "unknown transport 'http'; allowed: shm, udpv4, udpv6, udpm, tcpv4",
             _HOW,
         ),
-        ("", "unknown transport ''; allowed: udpv4, udpv6, udpm, tcpv4, shm", _HOW),
+        ("", "unknown transport ''; allowed: shm, udpv4, udpv6, udpm, tcpv4", _HOW),
         ("udpv4://10.77.0.1:65536", "its port is no number of 1–65535", _HOW),
         ("udpv4://10.77.0.1:x", "its port is no number of 1–65535", _HOW),
         ("udpv4://10.77.0.1:0", "port 0 is none: leave it out to let the middleware choose", ""),

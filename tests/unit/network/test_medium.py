@@ -16,7 +16,6 @@ from lifecycle.network.medium import (
     RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     SAFE_DATAGRAM_BYTES,
-    SCHEMES,
     UDP_UNICAST,
     FlowTransport,
     Medium,
@@ -38,8 +37,7 @@ def test_a_medium_is_its_word_in_text_in_json_and_as_a_key() -> None:
 
 
 def test_connections_are_made_of_the_same_media_however_they_are_listed() -> None:
-    assert {*CONNECTABLE} == {*SCHEMES}
-    assert {*Medium} - {*SCHEMES} == {Medium.TCPV6, Medium.INTRAPROCESS}
+    assert {*Medium} - {*CONNECTABLE} == {Medium.TCPV6, Medium.INTRAPROCESS}
     assert {*Medium} - NETWORK_MEDIA == {Medium.SHM, Medium.INTRAPROCESS}
 
 
@@ -78,7 +76,6 @@ def test_the_medium_to_an_address_is_udp_over_its_version_of_ip() -> None:
 
 def test_media_are_listed_in_the_orders_that_messages_have() -> None:
     assert ", ".join(CONNECTABLE) == "shm, udpv4, udpv6, udpm, tcpv4"
-    assert ", ".join(SCHEMES) == "udpv4, udpv6, udpm, tcpv4, shm"
     assert ", ".join(UDP_UNICAST) == "udpv4, udpv6"
     assert (RMW_DISCOVERY, DEFAULT_TCP) == ("udpv4", "tcpv4")
 
