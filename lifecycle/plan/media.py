@@ -36,7 +36,6 @@ from lifecycle.network.medium import (
     TRANSPORTS_VARIABLE,
     Medium,
     is_fragmented,
-    max_unfragmented,
 )
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.discovery import Contact, Hosts, contacts_of, is_fixed, ports_of
@@ -523,8 +522,7 @@ def _too_large(pair: Pair, max_datagram_bytes: int | None) -> str:
     Either end can deny that the data bear an unreliable transport.
     """
     size = pair.writer.max_message_size
-    limit = max_datagram_bytes or max_unfragmented(ipv6=":" in pair.publisher.host)
     denied = False in (pair.writer.lossy, pair.reader.lossy)
-    if denied and size is not None and is_fragmented(size, limit):
+    if denied and size is not None and is_fragmented(size, pair.publisher.host, max_datagram_bytes):
         return f"not lossy, and {size} bytes are more than one datagram"
     return ""
