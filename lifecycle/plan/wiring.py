@@ -18,7 +18,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -268,7 +268,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     static = data_layer.source is DataLayerSource.STATIC
     if static:
         graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
-        if found := tuple(_unconnectable(graph, plan, links)):
+        if found := tuple(_unconnectable(graph, links)):
             raise ManifestError(found)
         plan = with_graph(plan, graph)
     may_use_tcp = not static and _may_use_tcp(plan)
@@ -284,8 +284,8 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
     negotiated = {(each.topic, each.publisher, each.subscription): each for each in graph.flows}
 
     def with_medium(flow: PlannedFlow) -> PlannedFlow:
-        found = negotiated.get((flow.topic, flow.publisher, flow.subscription))
-        return replace(flow, medium=found.medium, medium_reason=found.reason) if found else flow
+        found = negotiated.get((flow.topic, flow.publisher, flow.subscription), flow)
+        return replace(flow, medium=found.medium, medium_reason=found.medium_reason)
 
     return replace(
         plan,
@@ -316,24 +316,15 @@ def _may_use_tcp(plan: Plan) -> bool:
     return reliable or any(each and (each.is_tcp or each.is_group) for each in wishes)
 
 
-def _unconnectable(
-    graph: DataLayerGraph, plan: Plan, links: Sequence[Link]
-) -> Iterator[Diagnostic]:
+def _unconnectable(graph: DataLayerGraph, links: Sequence[Link]) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
-    start = Position(file=plan.manifest_path, line=1, column=1)
     asked: dict[tuple[str, str, str], Position] = {}
-    for each in links:
-        if each.transport is not FlowTransport.ANY:
-            asked.setdefault((each.topic, each.from_node, each.to_node), each.at)
-    endpoints: dict[tuple[str, str], Position] = {}
-    for node in plan.nodes:
-        for endpoint in node.endpoints:
-            if endpoint.kind is EndpointKind.PUBLISHER:
-                endpoints.setdefault((node.key, endpoint.resolved), endpoint.at)
-    for problem in graph.problems:
-        link = asked.get((problem.topic, problem.publisher, problem.subscription))
-        at = link or endpoints.get((problem.publisher, problem.topic)) or start
-        yield error("plan.unconnectable", at, problem.problem, problem.hint)
+    for link in links:
+        if link.transport is not FlowTransport.ANY:
+            asked.setdefault((link.topic, link.from_node, link.to_node), link.at)
+    for each in graph.problems:
+        ends = (each.flow.topic, each.flow.publisher, each.flow.subscription)
+        yield replace(each.why, at=asked.get(ends, each.why.at))
 
 
 DATA = "data"
