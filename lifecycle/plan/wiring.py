@@ -143,15 +143,11 @@ def _groups(node: Node, needs: FlowNeeds) -> list[list[ResolvedNeed]]:
     return list(found.values())
 
 
-def _asked(
-    needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant],
-    marks: Sequence[int | None] = (),
-) -> dict[str, Any]:
+def _asked(needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant]) -> dict[str, Any]:
     """Return what a participant must do for all that it carries; it can have one mark."""
-    dscps = (*marks, *(each.dscp for each in needs))
     sizes = [each.max_datagram_bytes for each in needs if each.max_datagram_bytes is not None]
     return {
-        "dscp": next((each for each in dscps if each is not None), None),
+        "dscp": next((each.dscp for each in needs if each.dscp is not None), None),
         "max_datagram_bytes": min(sizes, default=None),
         "non_blocking_send": any(each.non_blocking_send for each in needs),
     }
@@ -173,7 +169,7 @@ def _connection(
         connection=connection.name,
         connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
         declared=True,
-        **_asked(needs, [url.dscp for url in connection.urls]),
+        **_asked(needs),
     )
 
 
