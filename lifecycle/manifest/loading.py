@@ -104,10 +104,11 @@ def load(
         raise ManifestError(in_order(found, loading.files))
     files = ParameterFiles(manifest.path)
     manifest = settle(_without_left_out(manifest), files, found)
-    if not manifest.nodes and manifest.left_out:
+    if not manifest.nodes:
         at = Position(file=manifest.path, line=1, column=1)
-        message = "cannot run a system without nodes: conditions leave out all of them"
-        hint = "lifecycle check --arguments lists what they follow"
+        why = ": conditions leave out all of them" if manifest.left_out else ""
+        hint = "lifecycle check --arguments lists what they follow" if why else ""
+        message = f"cannot run a system without nodes{why}"
         found.append(error("manifest.condition", at, message, hint))
     if not _has_errors(found):
         found += check(manifest, environment=variables, files=files)
@@ -269,12 +270,7 @@ class _Loading:
         substituted = substitute(document, given, surroundings, include=entry)
         self.found += substituted.found
         document = substituted.document
-        emptied = [
-            place[:-1]
-            for place in substituted.left_out
-            if (around_it := document.find(place[:-1])) is not None and not around_it.data
-        ]
-        ignore = [*substituted.broken, *substituted.left_out, *emptied]
+        ignore = [*substituted.broken, *substituted.left_out]
         self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return

@@ -485,9 +485,6 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
             require(each.attach is not False and _written(each, each.ONE_OF) == 1)
 
 
-NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
-
-
 class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One other manifest.
 
@@ -530,7 +527,7 @@ class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True)
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     remap: dict[Text, Text] = field(default_factory=dict)
     groups: tuple[Group, ...] | None = None
-    nodes: NodesByKey | None = None
+    nodes: dict[Name, Node] | None = None
     include: tuple[Include, ...] | None = None
 
     def __post_init__(self) -> None:
