@@ -11,10 +11,10 @@ import csv
 import datetime as dt
 import io
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from msgspec import to_builtins
 from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import json_of, terminal_width, unwritable, wrapped
@@ -128,35 +128,14 @@ def _unpaired(flow: FlowReport) -> str:
     return " → ".join(" ".join(dict.fromkeys(each)) or "unknown" for each in ends)
 
 
-COLUMNS: dict[str, Callable[[FlowReport, Any], object]] = {
-    "topic": lambda report, _: report.topic,
-    "publisher": lambda report, _: report.publisher,
-    "subscription": lambda report, _: report.subscription,
-    "transport_protocol": lambda _, flow: flow and flow.transport_protocol.value,
-    "internet_protocol": lambda _, flow: flow and flow.internet_protocol.value,
-    "source_address": lambda _, flow: flow and flow.source_address,
-    "source_port": lambda _, flow: flow and flow.source_port,
-    "destination_address": lambda _, flow: flow and flow.destination_address,
-    "destination_port": lambda _, flow: flow and flow.destination_port,
-    "flow_label": lambda _, flow: flow and flow.label,
-    # Only what was read back from the sockets: an RMW reports 0 whatever is marked.
-    "dscp": lambda report, _: report.dscp,
-    "dscp_name": lambda report, _: None if report.dscp is None else dscp_name(report.dscp),
-    "tos": lambda report, _: None if report.dscp is None else tos(report.dscp),
-    "unique": lambda report, _: report.unique and report.unique.value,
-    "demanded": lambda report, _: report.demanded.value,
-    "publisher_requirement": lambda report, _: report.requirement[0].value,
-    "subscription_requirement": lambda report, _: report.requirement[1].value,
-    "max_delay_ms": lambda report, _: (
-        None if report.max_delay_ms is None else f"{report.max_delay_ms:g}"
-    ),
-    "outcome": lambda report, _: report.outcome.value,
-    "five_qi": lambda report, _: report.five_qi,
-    "five_qi_reason": lambda report, _: report.five_qi_reason,
-    "effective_transport": lambda report, _: report.effective_transport,
-}
-"""Header → cell, of a report and one of its flows. None, something that is not known or does not
-apply, is an empty cell.
+COLUMNS = (
+    *("topic", "publisher", "subscription", "transport_protocol", "internet_protocol"),
+    *("source_address", "source_port", "destination_address", "destination_port", "flow_label"),
+    *("dscp", "dscp_name", "tos", "unique", "demanded"),
+    *("publisher_requirement", "subscription_requirement", "max_delay_ms", "outcome"),
+    *("five_qi", "five_qi_reason", "effective_transport"),
+)
+"""Of CSV. What is not known or does not apply is an empty cell.
 
 `flow_label` is five hex digits, or `unset` where the sender sets none; empty on IPv4.
 """
@@ -170,13 +149,22 @@ def flows_to_csv(flows: Iterable[FlowReport], measured: Mapping[Pair, FlowMeasur
     are what has arrived of the pair, empty where that is not measured.
     """
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*COLUMNS, *NUMBERS))
+    heads = (*COLUMNS, *NUMBERS)
+    writer = csv.DictWriter(text, heads, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for report in flows:
-        found = measured.get(report.pair)
-        numbers = [None] * len(NUMBERS) if found is None else [*found.numbers().values()]
+        numbers = measured[report.pair].numbers() if report.pair in measured else {}
+        of_pair = {**to_builtins(report), **numbers}
+        of_pair["publisher_requirement"], of_pair["subscription_requirement"] = (
+            each.value for each in report.requirement
+        )
+        if report.dscp is not None:
+            of_pair |= {"dscp_name": dscp_name(report.dscp), "tos": tos(report.dscp)}
+        if report.max_delay_ms is not None:
+            of_pair["max_delay_ms"] = f"{report.max_delay_ms:g}"
         for flow in report.tuples or (None,):
-            writer.writerow([*(cell(report, flow) for cell in COLUMNS.values()), *numbers])
+            of_flow = to_builtins(flow) | {"flow_label": flow.label} if flow else {}
+            writer.writerow({**of_flow, **of_pair})
     return text.getvalue()
 
 

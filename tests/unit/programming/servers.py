@@ -70,7 +70,8 @@ class Clock:
 
         wall = types.SimpleNamespace(time=lambda: self.now + self.is_set_s)
         monkeypatch.setattr(asyncio, "sleep", sleep)
-        monkeypatch.setattr("lifecycle.programming.camara.steady_s", lambda: self.now)
+        for module in ("camara", "server"):
+            monkeypatch.setattr(f"lifecycle.programming.{module}.steady_s", lambda: self.now)
         monkeypatch.setattr("lifecycle.programming.camara.time", wall)
 
 
