@@ -332,10 +332,6 @@ def _takes_one(callback: Callable[..., Any]) -> bool:
     return True
 
 
-_SYSTEM_DEFAULT_DEPTH = 1
-"""Fast DDS 2.14's own, for a profile that leaves history to the middleware."""
-
-
 class Kept:
     """The last messages of one publisher, serialized: its TRANSIENT_LOCAL history.
 
@@ -343,12 +339,10 @@ class Kept:
 
     Args:
         depth: how many, > 0; None for all.
-        lifespan_ns: older ones are not worth anything any more; None for ever.
     """
 
-    def __init__(self, depth: int | None, lifespan_ns: int | None = None) -> None:
-        self._samples: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
-        self._lifespan_ns = lifespan_ns
+    def __init__(self, depth: int | None) -> None:
+        self._messages: collections.deque[bytes] = collections.deque(maxlen=depth)
 
     @classmethod
     def of(cls, qos: QosProfile | None) -> Kept | None:
@@ -357,28 +351,23 @@ class Kept:
             return None
         if qos.history is History.KEEP_ALL:
             return None
-        depth = qos.depth if qos.history is History.KEEP_LAST else 0
-        return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
+        # A profile may leave the depth to the middleware: 1 with Fast DDS 2.14.
+        return cls(qos.depth if qos.history is History.KEEP_LAST and qos.depth else 1)
 
     def add(self, msg: Any) -> None:
         """Keep a message, or serialized bytes, as it is now: its author may change it later."""
         from rclpy.serialization import serialize_message
 
-        data = msg if isinstance(msg, bytes) else serialize_message(msg)
-        self._samples.append((time.monotonic_ns(), data))
+        self._messages.append(msg if isinstance(msg, bytes) else serialize_message(msg))
 
     def send_again(self, publisher: Publisher) -> None:
         """Publish what is kept by another publisher."""
-        oldest_ns = 0
-        if self._lifespan_ns:
-            oldest_ns = time.monotonic_ns() - self._lifespan_ns
-        for said_ns, data in self._samples:
-            if said_ns >= oldest_ns:
-                publisher.publish(data)
+        for data in self._messages:
+            publisher.publish(data)
 
     def forget(self) -> None:
         """Nothing was said."""
-        self._samples.clear()
+        self._messages.clear()
 
 
 class DeclaredPublisher:
