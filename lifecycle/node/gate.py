@@ -59,7 +59,6 @@ class NodeGate:
         self.is_open = False
         self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
-        self._left: dict[str, Counter] = {}  # of subscriptions that are gone, by topic
         self._opened_ns = 0
 
     def add(self, entity: object, gated: Gated) -> None:
@@ -69,10 +68,7 @@ class NodeGate:
 
     def remove(self, entity: object) -> None:
         """Close and forget an entity that is being destroyed."""
-        gone = self._entities.pop(id(entity), None)
-        if isinstance(gone, GatedSubscription) and gone.counter is not None:
-            self._left[gone.topic] = gone.counter
-        if gone is not None:
+        if (gone := self._entities.pop(id(entity), None)) is not None:
             gone.close()
 
     def measure(self, apart: Collection[str]) -> None:
@@ -103,18 +99,9 @@ class NodeGate:
         for gated in tuple(self._entities.values()):
             gated.open()
 
-    def counter(self, topic: str) -> Counter:
-        """Return what is to count a topic: of a subscription made anew, what counted before."""
-        is_apart = topic in self.apart
-        counter = self._left.pop(topic, None)
-        if counter is None or counter.is_apart is not is_apart:
-            counter = Counter(time.monotonic_ns(), time.time_ns(), is_apart=is_apart)
-        return counter
-
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
         self.is_open = False
-        self._left.clear()
         for gated in tuple(self._entities.values()):
             gated.close()
 
@@ -229,7 +216,7 @@ class GatedSubscription:
         if not self._gate.counts:
             self._subscription.callback = self._call
         elif self.counter is None or self.counter.is_apart is not is_apart:
-            self.counter = self._gate.counter(self.topic)
+            self.counter = Counter(time.monotonic_ns(), time.time_ns(), is_apart=is_apart)
             self._subscription.callback = counting(self._call, self.counter)
         if self._kept and self._later is not None:
             self._later(self._deliver)
