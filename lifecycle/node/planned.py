@@ -126,15 +126,10 @@ def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any
     if callable(found) and not isinstance(found, type):
         function: Callable[..., Any] = found
         return function
-    nodes = [
-        each
-        for each, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Node)
-    ]
     what = "has no" if found is None else "has, but not as a node class or a function,"
     raise BringUpError(
         f"cannot use {reference!r}: {module_name} {what} {name!r}",
-        hint=did_you_mean(name, nodes) or f"node classes there: {nodes or 'none'}",
+        hint=did_you_mean(name, vars(module)),
     )
 
 
