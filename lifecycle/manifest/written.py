@@ -246,8 +246,8 @@ def _interface_type(kind: str, example: str) -> Meta:
     )
 
 
-class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One endpoint.
+class ActionEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One server or client of an action.
 
     Attributes:
         name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
@@ -256,36 +256,26 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     name: Text
+    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
     description: str = ""
 
 
-class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One server or client of an action."""
-
-    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
-
-
-class QosEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One endpoint of a topic or service.
+class TopicEndpoint(ActionEndpoint, frozen=True, kw_only=True):
+    """One publisher or subscription.
 
     Attributes:
         qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
             make the endpoint with; nothing requires them.
     """
 
+    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
     qos: Preset | Qos | None = None
 
 
-class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
+class ServiceEndpoint(TopicEndpoint, frozen=True, kw_only=True):
     """One server or client of a service."""
 
     type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
-
-
-class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One publisher or subscription."""
-
-    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
 
 Preset = Literal[
