@@ -232,13 +232,9 @@ def with_findings(verdict: Verdict, findings: tuple[Finding, ...], policy: Polic
     """
     if not findings:
         return verdict
-    added = with_only(verdict, findings, policy)
-    return replace(
-        added,
-        verdict=Outcome.worst((verdict.verdict, added.verdict)),
-        blocking=verdict.blocking or added.blocking,
-        findings=(*findings, *verdict.findings),
-    )
+    added = with_only(verdict, (*findings, *verdict.findings), policy)
+    worst = Outcome.worst((verdict.verdict, added.verdict))
+    return replace(added, verdict=worst, blocking=verdict.blocking or added.blocking)
 
 
 def _tolerated(view: View) -> tuple[ToleratedNode, ...]:

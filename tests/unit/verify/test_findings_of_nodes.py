@@ -14,7 +14,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipan
 from lifecycle.verify.observation import Identity, NodeConfiguration
 from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.verdict import Finding, Stage
-from tests.builders import endpoint, node, planned, publisher, subscription, teleop
+from tests.builders import node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
     add_configuration,
@@ -499,116 +499,6 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
 def test_what_is_found_where(case: str):
     how, expected = SAYS[case]
     assert sorted(lines(findings_of(how))) == sorted(expected)
-
-
-WRONG = "std_srvs/srv/Empty"
-FOUR = planned(
-    node("one", publisher("a"), endpoints=EndpointPolicy.OPEN),
-    node("plain", run=Run(kind=RunKind.ATTACH), managed=False),
-    node("two", publisher("b"), subscription("c")),
-    node("wild", publisher("d"), run=Run(kind=RunKind.ATTACH)),
-)
-ASKING = planned(
-    node("base", endpoint(SERVER, "a", TRIGGER, None), endpoint(SERVER, "b", TRIGGER, None)),
-    node("panel", endpoint(CLIENT, "a", TRIGGER, None), endpoint(CLIENT, "b", TRIGGER, None)),
-)
-
-
-def gone(name: str) -> Edit:
-    """Nothing of the node is seen."""
-    return both(
-        drop_node(name),
-        drop_report(name),
-        lambda seen: replace(
-            seen, endpoints=tuple(each for each in seen.endpoints if each.node != name)
-        ),
-    )
-
-
-def reporting_itself(name: str, state: str) -> Edit:
-    """A node that another program runs reports as ours do."""
-    return add_configuration(
-        replace(perfect(PLAN).configurations[0], name=name, state=state, endpoints=())
-    )
-
-
-SUBJECTS: dict[str, tuple[Case, list[str]]] = {
-    "one of two reports of one name is late, and the graph shows one node": (
-        Case("graph.duplicate-node", add_configuration(twin(1))),
-        ["/robot/camera"],
-    ),
-    "nothing of a node is seen whose endpoints are hidden anyway": (
-        Case("graph.unseen-endpoint", gone("/talker"), wired(FOREIGN, "talker")),
-        [],
-    ),
-    "undeclared clients of a service of nobody, of a declared one, and of one of another type": (
-        Case(
-            "graph.type-mismatch",
-            both(
-                add_endpoint(CLIENT, "/other", "/a", type=WRONG),
-                add_endpoint(CLIENT, "/other", CALIBRATE, type=TRIGGER),
-                add_endpoint(ACTION_CLIENT, "/other", DOCK, type=WRONG),
-            ),
-            OPEN,
-        ),
-        [DOCK],
-    ),
-    "a tool publishes in a system that is open": (
-        Case("graph.undeclared-publisher", add_endpoint(PUB, "/rviz2", STATUS, gid="99"), OPEN),
-        [],
-    ),
-    "the server of a client that counts none is missing": (
-        Case(
-            "graph.unmatched-client",
-            both(drop_endpoint(SERVER, "/a"), change_report(CLIENT, "/a", server_matched=False)),
-            ASKING,
-        ),
-        [],
-    ),
-    "a client is about to go": (
-        Case(
-            "graph.unmatched-client",
-            change_report(CLIENT, CALIBRATE, mapped=False, server_matched=False),
-        ),
-        [],
-    ),
-    "a node of another machine is active already": (
-        Case(
-            "state.wrong-state",
-            change_node("/wild", state="active"),
-            FOUR,
-            machines=frozenset({"far"}),
-        ),
-        [],
-    ),
-    "a node of another machine is inactive after the gate": (
-        Case(
-            "state.wrong-state",
-            change_node("/wild", state="inactive"),
-            FOUR,
-            Stage.ACTIVE,
-            frozenset({"far"}),
-        ),
-        ["/wild"],
-    ),
-    "only its report says that a node of others is managed": (
-        Case(
-            "state.wrong-state",
-            both(
-                change_node("/wild", state=None, managed=False),
-                reporting_itself("/wild", "inactive"),
-            ),
-            FOUR,
-        ),
-        ["/wild"],
-    ),
-}
-
-
-@pytest.mark.parametrize("case", SUBJECTS)
-def test_findings_are_on_these_alone_where(case: str):
-    how, expected = SUBJECTS[case]
-    assert [each.subject for each in findings_of(how)] == expected
 
 
 @pytest.mark.parametrize(

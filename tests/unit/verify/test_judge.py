@@ -24,7 +24,6 @@ from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 CLIENT, SERVER = EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER
-STRING = "std_msgs/msg/String"
 
 
 def plan_of(**policy: object) -> Plan:

@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
-from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, link, nfe, node, planned, publisher, subscription
@@ -444,25 +443,3 @@ def test_a_publisher_that_was_remapped_is_missing_whether_or_not_discovery_shows
         ("graph.missing-endpoint", "violated", "/video"),
         ("graph.undeclared-publisher", "violated", "/stage/video"),
     ]
-
-
-def test_a_connection_of_a_node_that_is_not_there_is_not_named_besides() -> None:
-    def gone(seen: Observation) -> Observation:
-        rest = tuple(each for each in seen.endpoints if each.node != "/_camera_net")
-        return replace(seen, endpoints=rest)
-
-    absent = both(gone, HIDDEN, drop_node("/camera"), change_configuration("/camera", endpoints=()))
-    edit = both(absent, change_configuration("/camera", connections=()))
-    assert [each for each in findings(edit) if each[0].startswith("connection.")] == []
-    # The nodes after it are judged all the same.
-    late = both(edit, change_report(SUB, "/video", connection="late"))
-    assert told(late).subject == "/video"
-
-
-def test_that_a_node_does_not_report_is_said_once() -> None:
-    rules = {rule for rule, _, _ in findings(drop_report("/camera"))}
-    assert "config.missing-report" in rules
-    assert not {each for each in rules if each.startswith("connection.")}
-    of_others = {rule for rule, _, _ in findings(HIDDEN, plan_of(run=Run(kind=RunKind.ATTACH)))}
-    assert "graph.unseen-endpoint" in of_others
-    assert "graph.missing-endpoint" not in of_others

@@ -333,20 +333,3 @@ def test_numbers_are_named_of_what_is_there_and_of_nothing_else(edit, named):
 
 
 # --- DSCP
-
-
-def test_an_endpoint_without_a_dscp_does_not_end_the_judgement_of_the_others():
-    plan = planned(
-        node("one", publisher("a"), publisher("b"), needs=[need(PUB, "b", dscp=0)]),
-    )
-    edit = both(change_report(PUB, "/a", dscp=46), change_report(PUB, "/b", dscp=8))
-    assert [(each.subject, each.expected) for each in of_flows(edit, plan)] == [
-        ("/b", "DF = DSCP 0 = TOS 0 (0x00)")
-    ]
-
-
-def test_the_dscp_of_an_endpoint_that_is_missing_is_not_named_besides():
-    edit = both(drop_endpoint(PUB, "/a"), drop_endpoint_report(PUB, "/a"))
-    assert of_flows(edit, marked()) == []
-    late = both(edit, change_report(PUB, "/b", dscp=8))
-    assert [each.subject for each in of_flows(late, marked())] == ["/b"]

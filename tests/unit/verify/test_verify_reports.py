@@ -44,9 +44,7 @@ from tests.unit.verify.edits import (
     both,
     change_report,
     change_reported_qos,
-    drop_endpoint,
     drop_node,
-    drop_report,
     unchanged,
 )
 from tests.unit.verify.lines import verify
@@ -66,13 +64,6 @@ BAD = both(
     change_report(PUB, "/robot/battery", dscp=None),
 )
 NOT_DECLARED = add_node("/spy<&>\x07")
-EDITS = {
-    "ok": unchanged,
-    "bad": BAD,
-    "undeclared": NOT_DECLARED,
-    "gone": both(drop_node("/viewer"), drop_report("/robot/camera")),
-    "endpoint gone": drop_endpoint(PUB, "/robot/video"),
-}
 
 
 def schema(name: str) -> dict:
