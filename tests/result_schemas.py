@@ -28,6 +28,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import Verdict
 
 FOLDER = Path(__file__).parents[1] / "schemas"
@@ -37,12 +38,10 @@ _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE
 
 
 def _verdict(schema: _Schema) -> None:
-    """A verdict is written without what is empty, see `lifecycle.verify.report.to_json`."""
-    del schema["properties"]["blocking"], schema["$defs"]["Finding"]["properties"]["ends"]
+    """A verdict is written without what is as it mostly is."""
     schema["properties"]["judged"] |= {"const": False}
     run = schema["properties"]["run"]
     run |= run.pop("anyOf")[0]
-    schema["required"].remove("blocking")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +109,7 @@ RESULTS = {
                 *("timeouts", "log_level"),
             ),
         },
+        edit=lambda schema: schema["$defs"]["Run"]["properties"].pop("attach"),  # it is a kind
     ),
     "status": Result(
         type_=SystemStatus,
@@ -118,7 +118,7 @@ RESULTS = {
             "SystemStatus": ("not_ok", "mode", "manifest", "revision", "ends"),
             "NodeStatus": (
                 *("unreported", "silent", "died", "connections", "uptime_s", "restarts"),
-                *("last_failure", "next_try_s", "cpu_s", "rss_bytes", "threads"),
+                *("last_failure", "next_try_s"),
             ),
         },
     ),
@@ -145,7 +145,26 @@ def generate(name: str) -> str:
         "$defs": dict(sorted(defs.items())),
     }
     result.edit(schema)
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    return _text(schema)
+
+
+def _text(schema: _Schema) -> str:
+    """Return the text of a schema, with the rules of `lifecycle.verify` where they are meant."""
+    ids = [each.id for each in RULES]
+    families = dict.fromkeys(each.partition(".")[0] for each in ids)
+    lists = {"rules": ids, "rules and families": ["default", *families, *ids]}
+
+    def listed(part: Any) -> Any:
+        if isinstance(part, list):
+            return [*map(listed, part)]
+        if not isinstance(part, dict):
+            return part
+        found = {key: listed(each) for key, each in part.items()}
+        if isinstance(enum := part.get("enum"), str):
+            found["enum"] = lists[enum]
+        return found
+
+    return json.dumps(listed(schema), indent=2, ensure_ascii=False) + "\n"
 
 
 def _types(hint: Any) -> Iterator[type]:
@@ -214,12 +233,16 @@ def generate_manifest() -> str:
     )
     found = {each.__name__: each for type_ in types for each in _types(type_)}
     words = {
-        each: [each.value for each in type_] for each, type_ in found.items() if _is_enum(type_)
+        each: [each.value for each in type_ if each.value != "UNKNOWN"]  # that is only observed
+        for each, type_ in found.items()
+        if _is_enum(type_)
     }
     for name, type_ in found.items():
         if name not in words:
             defs[name] = _section(type_, defs[name])
-    reaction = {"enum": list(get_args(written.Reaction))}
+    for each in defs["Qos"]["properties"].values():
+        each.pop("default", None)  # of the endpoint's kind
+    reaction = {"enum": list(get_args(written.Word))}
     for_rules["not"] = {"required": ["mode"]}
     names = [name for each in code_points() for name in (each.name, *each.aliases)]
     special = {
@@ -242,7 +265,7 @@ def generate_manifest() -> str:
         "title": "Manifest of a ROS 2 system, version 1",
         "$defs": {**dict(sorted(whole.items())), "substitution": _A_SUBSTITUTION},
     }
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    return _text(schema)
 
 
 def _is_enum(type_: type) -> bool:
@@ -339,16 +362,17 @@ class _Opening:
         for key in ("items", "additionalProperties"):
             if isinstance(schema.get(key), dict):
                 schema[key] = self.value(schema[key])
+        if "propertyNames" in schema:
+            schema["propertyNames"] = self._branch(schema["propertyNames"])
         if "enum" in schema:
             words = self.order.get(frozenset(schema["enum"]), schema["enum"])
-            schema["enum"] = list(words)
+            schema["enum"] = words if isinstance(words, str) else list(words)
             if all(isinstance(each, str) for each in words):
                 schema = {"type": "string", **schema}
             if len(words) == 1 and not isinstance(words[0], str):
                 schema["const"] = schema.pop("enum")[0]
-        for each in (schema, schema.get("propertyNames", {})):
-            if "pattern" in each:  # \Z is Python's, and $ ECMA 262's
-                each["pattern"] = each["pattern"].replace(r"\Z", "$")
+        if "pattern" in schema:  # \Z is Python's, and $ ECMA 262's
+            schema["pattern"] = schema["pattern"].replace(r"\Z", "$")
         return schema
 
 

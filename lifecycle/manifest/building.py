@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -33,7 +34,6 @@ from lifecycle.manifest.model import (
     After,
     Condition,
     ConnectionDeclaration,
-    Consequence,
     EndpointKind,
     Executor,
     FlowNeed,
@@ -43,16 +43,15 @@ from lifecycle.manifest.model import (
     Mode,
     ModeParameter,
     Node,
-    OnViolation,
     ParameterValue,
     PublisherFlow,
     Quantity,
     Rate,
-    Reaction,
     Readiness,
     ReadyBy,
     Resources,
     Run,
+    RunKeys,
     RunKind,
     Supervision,
 )
@@ -69,18 +68,14 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         prefix: of their keys, `left/arm`; empty for none.
         namespace: before their own, `left/arm`; empty for none.
-        parameters: value and place, by name.
-        remap: new name and place, by the name in the node's code.
         machine: where a node runs that names no machine.
-        supervision: value and place, by key of `Supervision`.
+        values: value and place of what nodes share, by path as in `Node.positions`: `remap.scan`.
     """
 
     prefix: str = ""
     namespace: str = ""
     machine: str = THIS_HOST
-    parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
-    remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
-    supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
+    values: Mapping[str, tuple[Any, Position]] = msgspec.field(default_factory=dict)
 
     def inner(self, root: Document, found: Findings) -> Shared:
         """Return what holds inside a document or group, or in what an include names."""
@@ -93,17 +88,21 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
             )
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
             parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at())
-        remap = {name: (each.root.text, each.key_at()) for name, each in root.entries("remap")}
         keys = {key: value for key, value in root.plain().items() if key in SUPERVISION_KEYS}
         written = read(keys, Supervision, strict=False)
-        supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
         return Shared(
             prefix=self.key(root.text("prefix")) if "prefix" in root else self.prefix,
             namespace=self.within(root.text("namespace")),
             machine=root.text("machine", self.machine),
-            parameters={**self.parameters, **parameters},
-            remap={**self.remap, **remap},
-            supervision={**self.supervision, **supervision},
+            values={
+                **self.values,
+                **{f"parameters.{name}": each for name, each in parameters.items()},
+                **{
+                    f"remap.{name}": (each.root.text, each.key_at())
+                    for name, each in root.entries("remap")
+                },
+                **{key: (getattr(written, key), root.at((key,))) for key in keys},
+            },
         )
 
     def key(self, key: str) -> str:
@@ -116,31 +115,26 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself; who starts it otherwise restarts it."""
-        own, rules = dict(node.parameters), dict(node.remap)
-        parameters = {name: each for name, each in self.parameters.items() if name not in own}
-        remap = {name: each for name, each in self.remap.items() if name not in rules}
-        supervision = {
-            key: each
-            for key, each in self.supervision.items()
-            if key not in node.positions and node.run.kind is not RunKind.ATTACH
+        is_attached = node.run.kind is RunKind.ATTACH
+        given = {
+            path: each
+            for path, each in self.values.items()
+            if path not in node.positions and not (is_attached and path in SUPERVISION_KEYS)
         }
-        positions = {
-            **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
-            **{f"remap.{name}": at for name, (_, at) in remap.items()},
-            **{key: at for key, (_, at) in supervision.items()},
-        }
-        given = {key: value for key, (value, _) in supervision.items()}
+
+        def those(section: str) -> tuple[tuple[str, Any], ...]:
+            found = ((path.partition(".")[::2], value) for path, (value, _) in given.items())
+            return tuple((name, value) for (of, name), value in found if of == section)
+
+        supervision = {path: value for path, (value, _) in given.items() if "." not in path}
         return replace(
             node,
-            parameters=(
-                *((name, value) for name, (value, _) in parameters.items()),
-                *node.parameters,
-            ),
+            parameters=(*those("parameters"), *node.parameters),
             # rcl takes the first rule that matches: the node's own.
-            remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
-            supervision=replace(node.supervision, **given),
-            shared=node.shared | positions.keys(),
-            positions={**node.positions, **positions},
+            remap=(*node.remap, *those("remap")),
+            supervision=replace(node.supervision, **supervision),
+            shared=node.shared | given.keys(),
+            positions={**node.positions, **{path: at for path, (_, at) in given.items()}},
         )
 
 
@@ -245,21 +239,6 @@ def parameter_value(name: str, part: Document, found: Findings) -> ParameterValu
     return part.scalar
 
 
-def build_on_violation(section: Document) -> OnViolation:
-    """Build `on_violation` of a document or a node; a single value is for every rule."""
-    reactions = section.get("on_violation")
-    if reactions is None:
-        return ()
-    data = reactions.root.data
-    by_rule = isinstance(data, dict) and [*data] != ["mode"]
-    return tuple(
-        Reaction(rule=rule, what=Consequence.MODE, mode=each.text("mode"))
-        if isinstance(each.root.data, dict)
-        else Reaction(rule=rule, what=Consequence(each.scalar))
-        for rule, each in (reactions.entries() if by_rule else ((BY_DEFAULT, reactions),))
-    )
-
-
 _NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
 """Sections of which an entry is where its key is; of all others, a value is where it begins."""
 
@@ -347,13 +326,13 @@ def build_node(
         namespace=f"/{shared.within(node.namespace)}",
         machine=node.machine or shared.machine,
         process=shared.key(node.process) if node.process else "",
-        run=_run(part, base, shared, found),
+        run=_run(node.run, part, base, shared, found),
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
         remap=tuple(node.remap.items()),
         after=tuple(_after(part, shared, found)),
         supervision=build(Supervision, node),
-        on_violation=build_on_violation(part),
+        on_violation=node.on_violation.value if node.on_violation else (),
         interface=interface,
         flows=tuple(_flows(part)),
         connections=tuple(_connections(part, interface, found)),
@@ -395,11 +374,10 @@ def absolute(base: Path, path: str) -> str:
 _OF_PYTHON = ("arguments", "executor", "threads")
 
 
-def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
+def _run(run: RunKeys | None, node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     part = node.get("run")
-    if part is None:
+    if run is None or part is None:
         return Run(kind=RunKind.ATTACH)
-    run = read_part(part, written.Run)
     kind = RunKind.ATTACH if run.component or run.attach else RunKind.COMMAND
     meaningless: list[tuple[str, tuple[str, ...], str]] = []
     if run.python:
@@ -423,25 +401,17 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
         at = {key: part.key_at((key,)) for key in keys if key in part}
         found += [error(rule, at[key], f"cannot set {key} of {what}", "remove it") for key in at]
     resources = run.resources
-    if resources is not None and resources.memory_high_mib and resources.memory_max_mib:
-        high, most = resources.memory_high_mib, resources.memory_max_mib
-        if high >= most:
-            at_high = part.key_at(("resources", "memory_high_mib"))
-            message = (
-                f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
-            )
-            hint = "set it lower, or leave it out"
-            found.append(error("manifest.resources", at_high, message, hint))
-    container = run.container or ""
+    container = run.container
     return build(
         Run,
         run,
         kind=kind,
+        attach=None,  # it is a kind
         command=tuple(each.root.text for each in part.items("command")),
         arguments=_values(part, "arguments", found),
         extra_arguments=_values(part, "extra_arguments", found),
-        environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
-        working_directory=absolute(base, run.working_directory) if run.working_directory else "",
+        environment={name: each.root.text for name, each in part.entries("environment")},
+        working_directory=run.working_directory and absolute(base, run.working_directory),
         prefix=tuple(each.root.text for each in part.items("prefix")),
         resources=resources and build(Resources, resources, at=part.key_at(("resources",))),
         # A full name, or the key of a node of the system.
@@ -449,9 +419,9 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     )
 
 
-def _values(run: Document, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
-    values = ((name, parameter_value(name, each, found)) for name, each in run.entries(key))
-    return tuple((name, value) for name, value in values if value is not None)
+def _values(run: Document, key: str, found: Findings) -> dict[str, ParameterValue]:
+    values = {name: parameter_value(name, each, found) for name, each in run.entries(key)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
@@ -481,7 +451,6 @@ def _flows(node: Document) -> Iterator[FlowNeed]:
                 flow,
                 kind=kind,
                 name=name,
-                dscp=None if flow.dscp is None else flow.dscp.value,
                 five_qi=None if five_qi == "auto" else five_qi,
                 five_qi_auto=five_qi == "auto",
                 rate_hz=rate.max or rate.min if isinstance(rate, Rate) else rate,

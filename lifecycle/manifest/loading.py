@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -22,7 +22,6 @@ from lifecycle.manifest.building import (
     Shared,
     build_modes,
     build_node,
-    build_on_violation,
     positions_of,
     quantities,
     settle,
@@ -54,7 +53,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.written import build, read_part
+from lifecycle.manifest.written import OnViolation, build, read_part
 from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
@@ -196,24 +195,8 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     return replace(manifest, nodes=tuple(nodes), links=tuple(links), modes=tuple(modes))
 
 
-SUFFIX = ".lifecycle.yaml"
-"""What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
-
-
 _SECTIONS = ("discovery", "network", "data_layer", "on_violation")
 """Sections of a document that findings may be about."""
-
-
-class _Reading(msgspec.Struct, frozen=True, kw_only=True):
-    """One file while it is read: places in it are counted from its root.
-
-    Attributes:
-        chain: the manifests that include it, and itself.
-        left_out: places that conditions leave out.
-    """
-
-    chain: tuple[Path, ...]
-    left_out: tuple[Place, ...]
 
 
 NOTHING = Shared()
@@ -279,12 +262,6 @@ class _Loading:
             message = f"cannot use {what} as a manifest"
             self.found.append(error("manifest.kind", document.at(), message, hint))
             return
-        if not document.file.endswith(SUFFIX):
-            at = Position(file=document.file, line=1, column=1)
-            name = Path(document.file).name
-            message = f"cannot tell by its name {name!r} that this is a manifest"
-            stem = name.removesuffix(".yaml").removesuffix(".yml")
-            self.found.append(note("manifest.suffix", at, message, f"rename it to {stem}{SUFFIX}"))
         before = len(self.found)
         surroundings = Surroundings(
             environment=self._environment, folder=folder_of(path), programs=self._programs
@@ -305,13 +282,13 @@ class _Loading:
         for name, each in document.entries("machines"):
             self._machine(name, each)
         first_link = len(self._links)
-        reading = _Reading(chain=(*chain, path), left_out=tuple(substituted.left_out))
-        self._contents(reading, document, around, entry)
+        self._contents(document, around, entry, (*chain, path), substituted.left_out)
         links = [self._link(each, around) for each in document.items("links")]
         self._links[first_link:first_link] = links
 
     def _system(self, document: Document, arguments: tuple[tuple[str, str], ...]) -> None:
         """Build what is declared of the whole system: the outermost manifest's holds."""
+        reactions = document.get("on_violation")
         declared = Manifest(
             path=document.file,
             arguments=arguments,
@@ -321,7 +298,7 @@ class _Loading:
             network=read_part(document, Network, ("network",)),
             data_layer=read_part(document, DataLayer, ("data_layer",)),
             policy=read_part(document, Policy, ("policy",)),
-            on_violation=build_on_violation(document),
+            on_violation=read_part(reactions, OnViolation).value if reactions else (),
             modes=build_modes(document, self.found),
             positions={
                 **positions_of(document, _SECTIONS),
@@ -339,7 +316,12 @@ class _Loading:
                 self.found.append(note("manifest.include-ignored", at, message))
 
     def _contents(
-        self, reading: _Reading, root: Document, around: Shared, entry: Document | None
+        self,
+        root: Document,
+        around: Shared,
+        entry: Document | None,
+        chain: tuple[Path, ...],
+        without: Collection[Place],
     ) -> None:
         """Add what a document or group has; `entry` is the group or the include that it came by."""
         shared = around.inner(root, self.found)
@@ -347,7 +329,7 @@ class _Loading:
             node = build_node(
                 key,
                 part,
-                base=reading.chain[-1].parent,
+                base=chain[-1].parent,
                 shared=shared,
                 environment=self._environment,
                 found=self.found,
@@ -362,25 +344,23 @@ class _Loading:
                 self.found.append(error("manifest.duplicate-node", entry.at(), message, hint))
             if node.machine == THIS_HOST:
                 self._machines.setdefault(THIS_HOST, Machine(name=THIS_HOST, at=node.at))
-        left_out = [
-            str(place[-1]) for place in reading.left_out if place[:-1] == (*root.place, "nodes")
-        ]
+        left_out = [str(place[-1]) for place in without if place[:-1] == (*root.place, "nodes")]
         for each in root.items("include"):
-            if each.place not in reading.left_out:
-                path = _locate(each, reading.chain, self.found)
+            if each.place not in without:
+                path = _locate(each, chain, self.found)
                 self._documents += path is not None
                 if path is not None and self._documents <= MAX_MANIFESTS:
                     given = {name: one.root.text for name, one in each.entries("arguments")}
                     inner = shared.inner(each, self.found)
-                    self.read(path, given, chain=reading.chain, entry=each, around=inner)
+                    self.read(path, given, chain=chain, entry=each, around=inner)
                 elif path is not None and self._documents == MAX_MANIFESTS + 1:
                     message = f"cannot include more than {MAX_MANIFESTS} manifests"
                     self.found.append(error("manifest.include", each.at(), message))
             elif (prefix := each.text("prefix")) and "$(" not in prefix:
                 left_out.append(f"{prefix}/")
         for each in root.items("groups"):
-            if each.place not in reading.left_out:
-                self._contents(reading, each, shared, each)
+            if each.place not in without:
+                self._contents(each, shared, each, chain, without)
             else:
                 left_out += _keys_of(each.root)
         self._left_out += map(shared.key, left_out)
@@ -462,23 +442,13 @@ MAX_MANIFESTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-def _identity(path: Path) -> str:
-    """Return a path without links, to recognise a file again."""
-    try:
-        return os.path.realpath(path)
-    except (OSError, ValueError):  # a name that no file can have; opening it reports that
-        return str(path)
-
-
 def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
     """Return the file that an entry of `include:` names; None after reporting why there is none."""
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
-    identities = [_identity(each) for each in chain]
     why, hint = "", ""
-    if (identity := _identity(path)) in identities:
-        round_trip = [*chain[identities.index(identity) :], path]
-        why = f"it would include itself, {' → '.join(each.name for each in round_trip)}"
+    if path in map(Path, map(os.path.normpath, chain)):
+        why = "it would include itself"
     elif len(chain) == MAX_INCLUDE_DEPTH:
         why = f"at most {MAX_INCLUDE_DEPTH} manifests in a row"
     elif not os.path.exists(path):

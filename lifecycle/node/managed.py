@@ -58,6 +58,7 @@ class NodeInHost:
         listeners: are called with it after every change of state, whatever caused it.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories, by id of their object.
+        is_destroyed: its own code has destroyed it, in a process that goes on.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class NodeInHost:
         for name in _UNSAID:
             self._touch_after(name)
         self.found: dict[int, Endpoint] = {}
+        self.is_destroyed = False
 
     def _touch_after(self, name: str) -> None:
         """Have a method of the node followed by a look at its configuration."""

@@ -18,8 +18,8 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error
-from lifecycle.manifest.flows import ParticipantGroup
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DataLayerSource,
@@ -27,12 +27,12 @@ from lifecycle.manifest.model import (
     EndpointKind,
     FlowTransport,
     Link,
+    Node,
     RunKind,
 )
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import medium_of, udp_to
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.medium import Medium, udp_to
 from lifecycle.plan.discovery import (
     Hosts,
     PortPool,
@@ -43,8 +43,6 @@ from lifecycle.plan.discovery import (
 from lifecycle.plan.media import (
     DataLayerGraph,
     NegotiatedConnection,
-    Party,
-    carried,
     party_of_node,
     rmw_of,
     terms_of,
@@ -54,10 +52,8 @@ from lifecycle.plan.media import (
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
-    MAX_USER_ID,
     ParticipantConnections,
     Plan,
-    PlanError,
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
@@ -75,11 +71,22 @@ def participant_name(node_name: str, connection: str) -> str:
     return f"_{node_name}_{connection}"
 
 
+def own_transports(node: Node, needs: FlowNeeds) -> tuple[Medium, ...]:
+    """Return all that a node's own participant may use, and its subscriptions receive by.
+
+    Empty for any.
+    """
+    own = (
+        each.transports
+        for each in needs.of_node(node)
+        # A marked subscription receives on a participant beside it.
+        if each.need.kind is EndpointKind.SUBSCRIPTION and each.dscp is None and each.transports
+    )
+    return next(own, ())
+
+
 def place(
-    node_name: str,
-    endpoints: Sequence[PlannedEndpoint],
-    connections: Sequence[ConnectionDeclaration],
-    groups: Sequence[ParticipantGroup],
+    node: Node, endpoints: Sequence[PlannedEndpoint], needs: FlowNeeds
 ) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
     """Put endpoints on the connections that are declared for them, the others on what flows need.
 
@@ -88,23 +95,24 @@ def place(
     endpoints with `participant` filled in, and the participants, connections first.
     """
     places = {
-        entry: participant_name(node_name, connection.name)
-        for connection in connections
+        entry: participant_name(node.name, connection.name)
+        for connection in node.connections
         for entry in connection.map
     }
-    participants = [_connection(node_name, connection, groups) for connection in connections]
+    # Only a node in our own host can be given more participants; what others start keeps its own.
+    groups = _groups(node, needs) if node.run.kind is RunKind.PYTHON else []
+    participants = [_connection(node.name, each, groups) for each in node.connections]
     for group in groups:
-        names = tuple(name for name in group.names if (group.kind, name) not in places)
-        if names:
-            flow = participant_name(node_name, f"flow_{len(participants) - len(connections)}")
-            places |= {(group.kind, name): flow for name in names}
+        left = [each for each in group if (each.need.kind, each.need.name) not in places]
+        if left:
+            number = len(participants) - len(node.connections)
+            flow = participant_name(node.name, f"flow_{number}")
+            places |= {(each.need.kind, each.need.name): flow for each in left}
+            transports = left[0].transports or own_transports(node, needs)
+            asked = _asked(left)
+            reason = _reason(left, transports, asked["max_datagram_bytes"])
             participants.append(
-                PlannedParticipant(
-                    name=flow,
-                    reason=_reason(replace(group, names=names)),
-                    transports=group.transports,
-                    **_asked([group]),
-                )
+                PlannedParticipant(name=flow, reason=reason, transports=transports, **asked)
             )
     placed = tuple(
         replace(each, participant=places.get((each.kind, each.name), "")) for each in endpoints
@@ -112,28 +120,48 @@ def place(
     return placed, tuple(participants)
 
 
-def _asked(
-    needs: Sequence[ParticipantGroup] | Sequence[PlannedParticipant],
-    marks: Sequence[int | None] = (),
-) -> dict[str, Any]:
+def _groups(node: Node, needs: FlowNeeds) -> list[list[ResolvedNeed]]:
+    """Return the needs of endpoints by the extra participant that they share: as few as meet all.
+
+    A publisher that needs an NFE of its own shares with none. Others share if they ask for the
+    same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
+    acknowledgements leave by the sockets of the participant; they never share with publishers,
+    whose flow a network that looks at marks must not take theirs for. Within one node only: a
+    participant belongs to a node, whose hidden node is what the graph shows.
+    """
+    found: dict[object, list[ResolvedNeed]] = {}
+    own = own_transports(node, needs)
+    for endpoint in node.interface.endpoints:
+        each = needs.of(node.key, endpoint.kind, endpoint.name)
+        if each is None or not endpoint.kind.is_topic:
+            continue
+        class_ = (each.dscp, each.five_qi, each.transports or own, each.non_blocking_send)
+        if each.unique and endpoint.kind is EndpointKind.PUBLISHER:
+            found[endpoint.name] = [each]
+        elif class_ != (None, None, own, False) or each.max_datagram_bytes is not None:
+            found.setdefault((endpoint.kind, class_), []).append(each)
+    return list(found.values())
+
+
+def _asked(needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant]) -> dict[str, Any]:
     """Return what a participant must do for all that it carries; it can have one mark."""
-    dscps = (*marks, *(each.dscp for each in needs))
     sizes = [each.max_datagram_bytes for each in needs if each.max_datagram_bytes is not None]
     return {
-        "dscp": next((each for each in dscps if each is not None), None),
+        "dscp": next((each.dscp for each in needs if each.dscp is not None), None),
         "max_datagram_bytes": min(sizes, default=None),
         "non_blocking_send": any(each.non_blocking_send for each in needs),
     }
 
 
 def _connection(
-    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
+    node_name: str, connection: ConnectionDeclaration, groups: Sequence[Sequence[ResolvedNeed]]
 ) -> PlannedParticipant:
     """Return the participant of a connection, with what the flows of its endpoints ask for."""
     needs = [
-        group
+        each
         for group in groups
-        if {*connection.map} & {(group.kind, name) for name in group.names}
+        for each in group
+        if (each.need.kind, each.need.name) in connection.map
     ]
     return PlannedParticipant(
         name=participant_name(node_name, connection.name),
@@ -141,22 +169,26 @@ def _connection(
         connection=connection.name,
         connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
         declared=True,
-        **_asked(needs, [url.dscp for url in connection.urls]),
+        **_asked(needs),
     )
 
 
-def _reason(group: ParticipantGroup) -> str:
-    noun = f"{group.kind.noun}{'s' if len(group.names) > 1 else ''}"
-    facts = [f"{'unique ' if group.unique else ''}{noun} {', '.join(group.names)}"]
-    if group.dscp is not None:
-        facts.append(f"marked {describe(group.dscp)}")
-    if group.five_qi is not None:
-        facts.append(f"for 5QI {group.five_qi}")
-    if group.transports:
-        facts.append(f"by {' and '.join(group.transports)} only")
-    if group.max_datagram_bytes is not None:
-        facts.append(f"in datagrams of at most {group.max_datagram_bytes} bytes")
-    if group.non_blocking_send:
+def _reason(
+    needs: Sequence[ResolvedNeed], transports: tuple[Medium, ...], datagram_bytes: int | None
+) -> str:
+    first, names = needs[0], ", ".join(each.need.name for each in needs)
+    unique = first.unique and first.need.kind is EndpointKind.PUBLISHER
+    noun = f"{first.need.kind.noun}{'s' if len(needs) > 1 else ''}"
+    facts = [f"{'unique ' if unique else ''}{noun} {names}"]
+    if first.dscp is not None:
+        facts.append(f"marked {describe(first.dscp)}")
+    if first.five_qi is not None and not first.unique:
+        facts.append(f"for 5QI {first.five_qi}")
+    if transports:
+        facts.append(f"by {' and '.join(transports)} only")
+    if datagram_bytes is not None:
+        facts.append(f"in datagrams of at most {datagram_bytes} bytes")
+    if first.non_blocking_send:
         facts.append("sent without waiting")
     return " ".join(facts)
 
@@ -196,83 +228,12 @@ def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnecti
     return replace(node, endpoints=tuple(endpoints), participants=tuple(kept))
 
 
-_End = tuple[PlannedNode, PlannedEndpoint]
-
-
-def infeasible(
-    nodes: Sequence[PlannedNode], parties: Mapping[str, Party], *, negotiated: bool
-) -> Iterator[Diagnostic]:
-    """Yield what participants are asked for and cannot do.
-
-    Without `negotiated`, only topics on declared connections are where they will be.
-    """
-    placed = {
-        node.key: replace(parties[node.key], participants=node.participants) for node in nodes
-    }
-    yield from _services(nodes, placed)
-    for node in nodes:
-        party = placed[node.key]
-        for each in node.endpoints:
-            on = party.participant_of(each)
-            if negotiated or (on is not None and on.connection):
-                yield from _without_udp(node, each, party.transports_at(each))
-
-
-def _services(nodes: Sequence[PlannedNode], parties: Mapping[str, Party]) -> Iterator[Diagnostic]:
-    servers: dict[tuple[EndpointKind, str], list[_End]] = {}
-    for node in nodes:
-        for each in node.endpoints:
-            servers.setdefault((each.kind, each.resolved), []).append((node, each))
-    for node in nodes:
-        for each in node.endpoints:
-            if each.kind.is_topic or each.kind.offers:
-                continue
-            for other, server in servers.get((each.kind.other_end, each.resolved), ()):
-                party, serving = parties[node.key], parties[other.key]
-                mine, theirs = party.transports_at(each), serving.transports_at(server)
-                near = party.host == serving.host
-                if not mine or not theirs or carried(mine, theirs, same_host=near):
-                    continue
-                message = (
-                    f"cannot call {each.kind.meets_in} {each.resolved!r} of {other.key!r} from "
-                    f"{node.key!r}: the client's participant has {', '.join(mine)}, the server's "
-                    f"{', '.join(theirs)}, and they are on {'one host' if near else 'two hosts'}"
-                )
-                hint = "map both ends onto connections that have a transport in common"
-                yield error("plan.service-apart", each.at, message, hint)
-
-
-def _without_udp(
-    node: PlannedNode, each: PlannedEndpoint, by: tuple[str, ...]
-) -> Iterator[Diagnostic]:
-    if not by or any(medium_of(each).is_udp for each in by):
-        return
-    has = ", ".join(by)
-    if each.dscp is not None and each.enforce_dscp:
-        message = (
-            f"cannot mark {each.kind.noun} {each.name!r} of {node.key!r} {describe(each.dscp)}: "
-            f"its participant has {has}, and only UDP sockets can be marked"
-        )
-        hint = "use 'transport: udpv4', or remove the mark"
-        yield error("plan.mark-without-udp", each.at, message, hint)
-    if (
-        each.kind is EndpointKind.SUBSCRIPTION
-        and each.unique is UniqueRequirement.STRICTLY_REQUIRED
-    ):
-        message = (
-            f"cannot give subscription {each.name!r} of {node.key!r} a port of its own: its "
-            f"participant has {has}, and only UDP has one port for each subscription"
-        )
-        hint = "use 'transport: udpv4', or remove 'unique'"
-        yield error("plan.unique-without-udp", each.at, message, hint)
-
-
 def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     """Connect everything, beside declared connections and the extra participants of flows.
 
     Raises:
-        PlanError: a pair cannot be connected, a participant cannot do what is asked of it, or there
-            are not enough ports.
+        ManifestError: pairs cannot be connected.
+        PlanError: there are not enough ports.
     """
     discovery, data_layer = plan.discovery, plan.data_layer
     hosts = Hosts.of(plan)
@@ -297,7 +258,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        observers=_by_machine(own.with_tcp, hosts),
+        observers=_by_machine(own, hosts),
     )
     variables = dict(variables_of(plan))
     parties = {
@@ -305,14 +266,11 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
         for node in nodes
     }
     static = data_layer.source is DataLayerSource.STATIC
-    found: list[Diagnostic] = []
     if static:
         graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
-        found += _unconnectable(graph, plan, links)
+        if found := tuple(_unconnectable(graph, links)):
+            raise ManifestError(found)
         plan = with_graph(plan, graph)
-    found += infeasible(plan.nodes, parties, negotiated=static)
-    if found:
-        raise PlanError.of(tuple(found))
     may_use_tcp = not static and _may_use_tcp(plan)
     observers = connect_observers(plan, hosts, own, may_use_tcp=may_use_tcp)
     return replace(plan, observers=_by_machine(observers, hosts))
@@ -326,8 +284,8 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
     negotiated = {(each.topic, each.publisher, each.subscription): each for each in graph.flows}
 
     def with_medium(flow: PlannedFlow) -> PlannedFlow:
-        found = negotiated.get((flow.topic, flow.publisher, flow.subscription))
-        return replace(flow, medium=found.medium, medium_reason=found.reason) if found else flow
+        found = negotiated.get((flow.topic, flow.publisher, flow.subscription), flow)
+        return replace(flow, medium=found.medium, medium_reason=found.medium_reason)
 
     return replace(
         plan,
@@ -358,24 +316,15 @@ def _may_use_tcp(plan: Plan) -> bool:
     return reliable or any(each and (each.is_tcp or each.is_group) for each in wishes)
 
 
-def _unconnectable(
-    graph: DataLayerGraph, plan: Plan, links: Sequence[Link]
-) -> Iterator[Diagnostic]:
+def _unconnectable(graph: DataLayerGraph, links: Sequence[Link]) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
-    start = Position(file=plan.manifest_path, line=1, column=1)
     asked: dict[tuple[str, str, str], Position] = {}
-    for each in links:
-        if each.transport is not FlowTransport.ANY:
-            asked.setdefault((each.topic, each.from_node, each.to_node), each.at)
-    endpoints: dict[tuple[str, str], Position] = {}
-    for node in plan.nodes:
-        for endpoint in node.endpoints:
-            if endpoint.kind is EndpointKind.PUBLISHER:
-                endpoints.setdefault((node.key, endpoint.resolved), endpoint.at)
-    for problem in graph.problems:
-        link = asked.get((problem.topic, problem.publisher, problem.subscription))
-        at = link or endpoints.get((problem.publisher, problem.topic)) or start
-        yield error("plan.unconnectable", at, problem.problem, problem.hint)
+    for link in links:
+        if link.transport is not FlowTransport.ANY:
+            asked.setdefault((link.topic, link.from_node, link.to_node), link.at)
+    for each in graph.problems:
+        ends = (each.flow.topic, each.flow.publisher, each.flow.subscription)
+        yield replace(each.why, at=asked.get(ends, each.why.at))
 
 
 DATA = "data"
@@ -390,7 +339,7 @@ def place_static(
     A participant that makes a publisher's flow unique becomes a connection as well.
 
     Raises:
-        PlanError: too few ports, or more endpoints than there are ids.
+        PlanError: too few ports.
     """
     placed = [_place(node) for node in nodes]
     kind = udp_to("".join(hosts.used))
@@ -461,13 +410,6 @@ def _table(nodes: Sequence[PlannedNode]) -> Iterator[StaticParticipant]:
             lines = []
             for entry in (*(_line(each) for each in carried), *_GRAPH):
                 number += 1
-                if number > MAX_USER_ID:
-                    raise PlanError(
-                        f"cannot number more than {MAX_USER_ID} endpoints, which Fast DDS's static "
-                        "endpoint discovery allows",
-                        hint="use 'discovery: {mode: static}'",
-                        at=node.at,
-                    )
                 lines.append(replace(entry, user_id=number))
             yield StaticParticipant(name=_enclave(node, participant), endpoints=tuple(lines))
 

@@ -1,32 +1,26 @@
-"""What a network target is, what it changes, how long it is waited for, and what can go wrong."""
+"""What a network target is, what it changes, and what can go wrong."""
 
 from __future__ import annotations
 
 import abc
-import asyncio
-import contextlib
 import enum
 import importlib
 import math
-import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming import TARGETS
-from lifecycle.programming.rules import FlowRule, RuleSet
+from lifecycle.programming.rules import FlowRule, RuleSet, Treatment
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-_TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
-"""Targets → options that only they take."""
 
 
 class ChangeKind(enum.Enum):
@@ -62,13 +56,11 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         target: for people: "nft table inet flowqos_teleop", "tc on eth0".
         left_out: flows that this target cannot express, each with its reason.
-        warnings: what people should know, whole sentences.
     """
 
     target: str
     changes: tuple[FlowChange, ...] = ()
     left_out: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
     @property
     def pending(self) -> bool:
@@ -90,105 +82,28 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
             what = f": {each.what}" if each.what else ""
             lines.append(f"  {_SIGNS[each.kind]} {each.key}{what}{detail}")
         lines += [f"  left out: {reason}" for reason in self.left_out]
-        lines += [f"  warning: {warning}" for warning in self.warnings]
         return "\n".join(lines)
 
 
-_CANCEL_CHECK_S = 0.05
-
-
-class Patience:
-    """Bounds all that one programmer asks of servers; without end until `within`.
-
-    One thread works, another cancels.
-
-    Args:
-        attempts: at most so many requests.
-        first_s: wait before the second, then doubled each time.
-        longest_s: longest single wait of our own choice.
-        total_s: one request with all its attempts, and all waits between them; a Retry-After beyond
-            it is not waited for.
+class Means:
+    """What targets are opened with: the ledger of the system, and how long servers may take.
 
     Attributes:
-        cancelled: set while work is to end at once.
+        until_s: when all that servers are asked must have been answered, on the clock of
+            time.monotonic.
     """
 
-    def __init__(
-        self,
-        *,
-        attempts: int = 5,
-        first_s: float = 0.5,
-        longest_s: float = 8.0,
-        total_s: float = 60.0,
-    ) -> None:
-        self.attempts, self.first_s = attempts, first_s
-        self.longest_s, self.total_s = longest_s, total_s
-        self._until_s = math.inf
-        self.cancelled = threading.Event()
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self.until_s = math.inf
 
-    def now_s(self) -> float:
-        """Return seconds since the epoch."""
-        return time.time()
-
-    def steady_s(self) -> float:
-        """Return seconds since the host was started, on a clock that only goes forward."""
-        return time.clock_gettime(time.CLOCK_BOOTTIME)
-
-    def sleep(self, seconds: float) -> None:
-        """Wait, or until it is cancelled."""
-        self.cancelled.wait(seconds)
-
-    @contextlib.contextmanager
-    def within(self, seconds: float | None) -> Iterator[None]:
-        """Bound what is done inside, None by nothing; an outer bound holds as well."""
-        outer_s = self._until_s
-        if seconds is not None:
-            self._until_s = min(outer_s, time.monotonic() + seconds)
-        try:
-            yield
-        finally:
-            self._until_s = outer_s
+    def begin(self, within_s: float | None) -> None:
+        """Give servers so long from now on; None bounds each request only."""
+        self.until_s = math.inf if within_s is None else time.monotonic() + within_s
 
     def left_s(self) -> float:
         """Return the seconds that are left: 0 if none are, infinity if there is no bound."""
-        return 0.0 if self.cancelled.is_set() else max(0.0, self._until_s - time.monotonic())
-
-    def run(self, work: Coroutine[Any, Any, T], most_s: float) -> T:
-        """Run a coroutine to its end, or cancel it after `most_s`, or once there is no time left.
-
-        Raises:
-            TimeoutError: there was no time left.
-        """
-        # Not asyncio.run, which waits for names that are still looked up.
-        loop = asyncio.new_event_loop()
-        task = loop.create_task(work)
-        try:
-            with self.within(most_s):
-                loop.run_until_complete(self._bounded(task))
-            if not task.done():
-                raise TimeoutError
-            return task.result()
-        finally:
-            if task.cancel():
-                loop.run_until_complete(asyncio.wait([task]))
-            loop.run_until_complete(loop.shutdown_asyncgens())  # of an answer that is cut off
-            loop.close()
-
-    async def _bounded(self, task: asyncio.Task[Any]) -> None:
-        while not task.done() and (left_s := self.left_s()) > 0:
-            await asyncio.wait({task}, timeout=min(left_s, _CANCEL_CHECK_S))
-
-
-class Means(msgspec.Struct, frozen=True):
-    """What targets are opened with.
-
-    Attributes:
-        ledger: of the system.
-        patience: with servers, of all targets together.
-    """
-
-    ledger: Ledger
-    patience: Patience = msgspec.field(default_factory=Patience)
+        return max(0.0, self.until_s - time.monotonic())
 
 
 class Target(abc.ABC):
@@ -199,14 +114,14 @@ class Target(abc.ABC):
 
     Attributes:
         kind: name of the target.
+        takes: options that it reads.
         hint: how to give what it cannot do without; empty if there is nothing such.
-        settings_type: of its key in the settings file of servers; None if it is no server.
         name: for people: "nft table inet flowqos_teleop".
     """
 
     kind: ClassVar[str]
+    takes: ClassVar[tuple[str, ...]] = ()
     hint: ClassVar[str] = ""
-    settings_type: ClassVar[type[msgspec.Struct] | None] = None
     name: str
 
     def __init__(self, settings: Any, means: Means) -> None:
@@ -247,18 +162,21 @@ class Target(abc.ABC):
         return frozenset()
 
     @abc.abstractmethod
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+    async def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare what should be with what is; changes nothing."""
 
     @abc.abstractmethod
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Make it so, and return what was done; a second time changes nothing."""
+    async def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Make it so, and return what was done; a second time changes nothing.
 
-    def remove(self) -> TargetChanges:
+        Cancelled, what it may have made is in the ledger.
+        """
+
+    async def remove(self) -> TargetChanges:
         """Delete everything of ours."""
-        return self.apply(())
+        return await self.apply(())
 
-    def renew(self) -> float | None:
+    async def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
         return None
 
@@ -276,6 +194,19 @@ class Chosen(msgspec.Struct, frozen=True):
             UsageError: the options or the settings file cannot be used.
         """
         return self.target(self.settings, means)
+
+
+class Program(msgspec.Struct, frozen=True):
+    """The networks that a person asked for, and what flows get in them."""
+
+    targets: tuple[Chosen, ...]
+    treatment: Treatment = Treatment()
+
+    @property
+    def token_variables(self) -> frozenset[str]:
+        """The environment variables that hold tokens."""
+        found = (each.target.token_variables(each.settings) for each in self.targets)
+        return frozenset[str]().union(*found)
 
 
 def target_kind(name: str) -> type[Target]:
@@ -298,29 +229,25 @@ def read_targets(
     Raises:
         UsageError: they do not fit together.
     """
-    chosen = tuple(dict.fromkeys(names))
-    for those, flags in _TAKEN.items():
-        if not {*those} & {*chosen} and any(given.get(each) for each in flags):
-            needs = _either([f"--{each}" for each in flags])
-            raise UsageError(f"cannot use {needs} without {option} {_either(those)}")
-    kinds = map(target_kind, chosen)
+    kinds = [target_kind(each) for each in dict.fromkeys(names)]
+    taken = {flag for each in kinds for flag in each.takes}
+    for flag, value in given.items():
+        if value and flag not in taken:
+            chosen = ", ".join(each.kind for each in kinds)
+            why = f"with {option} {chosen}" if chosen else f"without {option}"
+            raise UsageError(f"cannot use --{flag} {why}")
     return tuple(Chosen(each, each.read(given)) for each in kinds)
 
 
-def _either(words: Sequence[str]) -> str:
-    *most, last = words
-    return f"{', '.join(most)} or {last}" if most else last
-
-
-def each_done(
-    things: Iterable[T], do: Callable[[T], R]
+async def each_done(
+    things: Iterable[T], do: Callable[[T], Awaitable[R]]
 ) -> tuple[list[R], list[tuple[T, LifecycleError]]]:
     """Do it to each, whatever becomes of the others; return what was done, and what failed."""
     done: list[R] = []
     failed: list[tuple[T, LifecycleError]] = []
     for each in things:
         try:
-            done.append(do(each))
+            done.append(await do(each))
         except LifecycleError as error:  # noqa: PERF203 - the others go on
             failed.append((each, error))
     return done, failed
@@ -342,25 +269,14 @@ class HttpError(ProgrammingError):
     Attributes:
         status: HTTP status; 0 if there was no answer.
         uncertain: the request may have taken effect all the same.
-        again: it may be asked again.
-        after_s: how long the server asks to wait before that; None if it does not say.
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        status: int = 0,
-        uncertain: bool = False,
-        again: bool = False,
-        after_s: float | None = None,
-        hint: str = "",
+        self, message: str, *, status: int = 0, uncertain: bool = False, hint: str = ""
     ) -> None:
         super().__init__(message, hint=hint)
         self.status = status
         self.uncertain = uncertain
-        self.again = again
-        self.after_s = after_s
 
 
 class PartlyError(ProgrammingError):

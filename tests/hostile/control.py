@@ -97,9 +97,7 @@ def _crowd(system: Running) -> None:
 
 
 def _followers_that_do_not_read(system: Running) -> None:
-    for _ in range(20):
-        system.connect().sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
-    for _ in range(20):
+    for _ in range(40):
         system.connect().sendall(to_json(Question(ask=ControlRequest.LOOK)) * 1 + b"\n")
     system.check()
 

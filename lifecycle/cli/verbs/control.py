@@ -193,12 +193,12 @@ def status_command(
 
 def _watch(path: Path, format_: str) -> int:
     from lifecycle.cli.standard_streams import watched
-    from lifecycle.supervisor.control.server import follow
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.verify.outcome import Outcome
 
     verdict, is_json = None, format_ == "json"
     with watched(whole=not is_json) as show, common.asking(path):
-        for seen in follow(path / "control"):
+        for seen in follow(path):
             status, verdict = seen.status, seen.status.verdict
             if is_json:
                 show(common.json_of(status))
@@ -253,11 +253,7 @@ def _give_order(
     from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
-    try:
-        answer = order(path, question, timeout)
-    except TimeoutError:
-        common.say(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it")
-        return ExitCode.BRING_UP_FAILED
+    answer = order(path, question, timeout)
     if answer.error:
         common.say(answer.error)
     assert answer.exit_code is not None

@@ -139,6 +139,7 @@ class Adoption:
         self._wrap("__init__", self._initialise)
         self._wrap("destroy_node", self._destroy)
         self._wrap("add_waitable", self._add_waitable)
+        self._wrap("remove_waitable", self._remove_waitable)
         for name, (kind, names) in _FACTORIES.items():
             self._wrap(name, functools.partial(self._create, kind, names))
         for name in _REMOVERS:
@@ -193,12 +194,22 @@ class Adoption:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.close()
         destroy(node)
+        for hosted in self.made.values():
+            if hosted.node is node and not hosted.is_destroyed:
+                hosted.is_destroyed = True
+                for listener in hosted.listeners:
+                    listener(hosted)
 
     def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
+        self._loop.take_waitable(node, waitable)  # before its executor can look
         add(node, waitable)
         kind, foreign = noted_action(node, waitable), self._foreign.get(id(node))
         if kind is not None and foreign is not None:
             foreign.made(kind, waitable)
+
+    def _remove_waitable(self, remove: Callable[..., None], node: Node, waitable: Any) -> None:
+        remove(node, waitable)
+        self._loop.watching.give_back(waitable)
 
     def _create(
         self,
@@ -222,7 +233,10 @@ class Adoption:
     def _remove(self, destroy: Callable[..., Any], node: Node, entity: Any) -> Any:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.removed(entity)
-        return destroy(node, entity)
+        result = destroy(node, entity)
+        for each in getattr(entity, "event_handlers", ()):
+            self._loop.watching.give_back(each)
+        return result
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
@@ -318,7 +332,7 @@ def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
     """Return what a class or function is called with; one that needs a `node_name` gets it."""
     keywords = {
         name: list(value) if isinstance(value, tuple) else value
-        for name, value in planned.run.arguments
+        for name, value in planned.run.arguments.items()
     }
     wanted = inspect.signature(what).parameters.get("node_name")
     named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)

@@ -132,6 +132,9 @@ class Heartbeat:
 
     def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends: meanwhile nothing else of its group runs."""
+        if hosted.is_destroyed:
+            self.rest(hosted.node)
+            return
         with self._lock:
             if not hosted.reported.steady:
                 self._changing.add(hosted.full_name)
@@ -186,13 +189,16 @@ class NodeLoop:
         self._executor = NodeExecutor(context=context)
         self._executor.add_node(self.watching)
         self._own: Any = self._executor
+        self._has_events = executor is Executor.EVENTS
         self._watchdog: Watchdog | None = None
         self._heartbeat: Heartbeat | None = None
         if executor is not Executor.SINGLE:
-            if executor is Executor.EVENTS:
+            if self._has_events:
                 from rclpy.experimental.events_executor import EventsExecutor
 
                 self._own = EventsExecutor(context=context)
+                # With a single node it crashes where a task raises: it indexes its set of nodes.
+                self._own.add_node(Watching())
             else:
                 count = threads or max(2, os.cpu_count() or 0)
                 self._own = MultiThreadedExecutor(count, context=context)
@@ -224,6 +230,8 @@ class NodeLoop:
     def spin(self, node: Node) -> None:
         """Run a node's callbacks from now on, unless its own code has another executor do it."""
         if node.executor is None or node.executor is self._own:
+            for each in node.waitables:
+                self._take(each)
             self._own.add_node(node)
             if self._heartbeat is not None:
                 self._heartbeat.spin(node)
@@ -234,6 +242,17 @@ class NodeLoop:
             if self._heartbeat is not None:
                 self._heartbeat.rest(node)
             self._own.remove_node(node)
+            for each in node.waitables:
+                self.watching.give_back(each)
+
+    def take_waitable(self, node: Node, waitable: Any) -> None:
+        """Wait for what a node is about to list in the way of the executor that runs it."""
+        if node.executor is self._own:
+            self._take(waitable)
+
+    def _take(self, waitable: Any) -> None:
+        if self._has_events:
+            self.watching.take_waitable(waitable, self.call_soon)
 
     def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
@@ -343,7 +362,7 @@ class NodeLoop:
         self.stop("a callback raised an exception", code=1)
 
     async def _shut_down(self, reason: str) -> None:
-        for hosted in reversed(self._hosted):
+        for hosted in reversed([each for each in self._hosted if not each.is_destroyed]):
             try:
                 await hosted.shut_down(reason)
             except Exception:  # noqa: BLE001, PERF203 - the other nodes must still be shut down

@@ -226,14 +226,15 @@ class ConnectionAuthority:
         self,
     ) -> Iterator[tuple[NodeConfiguration, Instructions, tuple[Command, ...]]]:
         """Yield of each node that can be wired now what it says, what it has and what it lacks."""
-        dead = self._system.dead()
         remote = {each.full_name for each in self._system.remote.values()}
         for name, wanted in self._instructions.items():
             node = self._system.node_named(name)
             said = self._others.get(name) if node is None else node.configuration
-            if said is None or said.state not in (INACTIVE, ACTIVE) or name in dead | remote:
+            if said is None or said.state not in (INACTIVE, ACTIVE) or name in remote:
                 continue
-            if node is not None and (node.driver is None or node.core.stuck or not said.connected):
+            if node is not None and (
+                node.is_gone or node.driver is None or node.core.stuck or not said.connected
+            ):
                 continue
             if node is not None and node.core.base is Level.ACTIVE:
                 continue  # it is verified as it was found
@@ -313,6 +314,12 @@ class ConnectionAuthority:
                     node.learn(configuration)
             self._system.emit(_done(step, attempt=wiring.rounds))
         self._system.touch()
+
+
+def _may_be_wired(node: NodeRun) -> bool:
+    """Whether a node can be asked; one that was found active is verified as it was found."""
+    asked = node.driver is not None and not (node.is_gone or node.core.stuck)
+    return asked and node.core.base is not Level.ACTIVE
 
 
 def _done(step: Command, *, attempt: int = 1, error: str = "") -> WiringChanged:

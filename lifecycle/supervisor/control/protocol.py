@@ -11,15 +11,16 @@ import contextlib
 import enum
 import os
 import signal
-import socket
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.measure.flows import FlowMeasurement
 from lifecycle.run_directory import (
     RunDirectory,
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 _LARGEST_ANSWER = 64 * 2**20
 """Bytes of a line; a look holds a whole plan and all that was seen."""
-ANSWER_S = 10.0
-"""For the rest of an answer that has begun."""
 _READ = 2**18
 
 
@@ -108,18 +107,14 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         flows: flows from or to it.
         findings: findings of the last verdict that concern it.
         silent: why nothing can be expected of it; empty while it is alive.
-        died: how its process ended unasked; empty while it runs. It then has no state, and no
-            matches.
+        died: how its process ended unasked, or that its own code destroyed it while that runs;
+            empty otherwise. It then has no state, and no matches.
         connections: as it reports them, its own participant left out.
         uptime_s: since its process was started; None while there is none of ours.
         restarts: how often its process was started again by policy.
         last_failure: of its process, that it was, or is to be, started again after; None if there
             was none.
         next_try_s: seconds until its process is started again; None if that is not planned.
-        cpu_s: user and system time that its process has used; None where none of ours runs. The
-            nodes of one process have the same, also of what follows.
-        rss_bytes: resident memory of its process, what it shares with others included.
-        threads: how many its process has.
     """
 
     node: str
@@ -143,9 +138,6 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     restarts: int = 0
     last_failure: Failed | None = None
     next_try_s: float | None = None
-    cpu_s: float | None = None
-    rss_bytes: int | None = None
-    threads: int | None = None
 
 
 class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -182,13 +174,18 @@ class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):
     measured: tuple[FlowMeasurement, ...] = ()
 
 
+def timeless(status: SystemStatus) -> SystemStatus:
+    """Return a status without what changes with every second."""
+    nodes = (replace(each, uptime_s=None, next_try_s=None) for each in status.nodes)
+    return replace(status, elapsed_s=0.0, nodes=tuple(nodes))
+
+
 class ControlRequest(enum.Enum):
     """What a supervisor can be asked."""
 
     STATUS = "status"
     DOWN = "down"
     LOOK = "look"
-    FOLLOW = "follow"
     PAUSE = "pause"
     RESUME = "resume"
     RESTART = "restart"
@@ -247,8 +244,7 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
         error: why an order was not carried out; empty if it was.
         differences: for STATUS with a plan, how that differs from what runs, one line each.
         change: for APPLY, what it is about.
-        look: for LOOK, and for FOLLOW at once and after each change, a SupervisorSnapshot: what
-            reads it knows its type, see server.py.
+        look: for LOOK, a SupervisorSnapshot: what reads it knows its type, see server.py.
     """
 
     status: SystemStatus | None = None
@@ -273,39 +269,18 @@ def ask(path: Path, question: Question, timeout_s: float) -> Answer | None:
     deadline = time.monotonic() + timeout_s
     with connect(path, timeout_s) as sock:
         sock.sendall(to_json(question) + b"\n")
-        return read_answer(path, sock, bytearray(), deadline)
-
-
-def read_answer(
-    path: Path, sock: socket.socket, rest: bytearray, deadline_s: float | None
-) -> Answer | None:
-    """Read one answer, bounded in time and size; None if there is none any more.
-
-    Args:
-        path: of the socket.
-        sock: connected to it.
-        rest: what was read beyond the answer before.
-        deadline_s: monotonic; None to wait for ever until one begins, and not long for its end.
-    """
-    searched = 0
-    while (end := rest.find(b"\n", searched)) < 0:
-        searched = len(rest)
-        if searched > _LARGEST_ANSWER:
-            raise strange(path, f"{searched} bytes without an end")
-        left_s = None if deadline_s is None else deadline_s - time.monotonic()
-        if left_s is not None and left_s <= 0:
-            raise TimeoutError
-        sock.settimeout(left_s)
-        data = sock.recv(_READ)
-        if not data:
-            return None
-        if deadline_s is None:
-            deadline_s = time.monotonic() + ANSWER_S
-        rest += data
-    line = bytes(rest[:end])
-    del rest[: end + 1]
+        line = bytearray()
+        while not line.endswith(b"\n"):  # nothing follows an answer
+            if len(line) > _LARGEST_ANSWER:
+                raise strange(path, f"{len(line)} bytes without an end")
+            if (left_s := deadline - time.monotonic()) <= 0:
+                raise TimeoutError
+            sock.settimeout(left_s)
+            if not (data := sock.recv(_READ)):
+                return None
+            line += data
     try:
-        return from_json(line, Answer)
+        return from_json(bytes(line), Answer)
     except ValueError as error:
         raise strange(path, str(error)) from error
 
@@ -348,6 +323,26 @@ def look(path: Path) -> SupervisorSnapshot:
     return shown(path / _SOCKET, _answered(path, Question(ask=ControlRequest.LOOK), STATUS_S))
 
 
+def follow(path: Path) -> Iterator[SupervisorSnapshot]:
+    """Yield what a supervisor knows, twice a second where that is new, until it has ended.
+
+    Raises:
+        UsageError: it runs no more.
+        TimeoutError: it does not answer.
+    """
+    from lifecycle.supervisor.control.server import shown
+
+    question, last = Question(ask=ControlRequest.LOOK), None
+    answer: Answer | None = _answered(path, question, STATUS_S)
+    while answer is not None:
+        seen = shown(path / _SOCKET, answer)
+        if (news := replace(seen, status=timeless(seen.status))) != last:
+            last = news
+            yield seen
+        time.sleep(_FOLLOWED_S)
+        answer = _asked(path, question, STATUS_S)
+
+
 def differences(path: Path, plan: Plan) -> tuple[str, ...]:
     """Ask a supervisor how `plan` differs from what it runs, one line each.
 
@@ -374,10 +369,16 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
 
     Raises:
         UsageError: it runs no more, or does not answer; it was ordered nothing then.
-        TimeoutError: it is not done after `timeout_s`; it goes on all the same.
+        BringUpError: it is not done after `timeout_s`; it goes on all the same.
     """
     _check_answers(path)
-    answer = _answered(path, question, timeout_s)
+    try:
+        answer = _answered(path, question, timeout_s)
+    except TimeoutError as error:
+        raise BringUpError(
+            f"cannot {question.ask.value} {path.name!r} within {timeout_s:g} s; it is still at it",
+            hint=f"see what it does: lifecycle status {path.name}",
+        ) from error
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
         why = "it has no exit code" if code is None else f"its exit code is {code}"
@@ -468,6 +469,8 @@ def _terminate(path: Path) -> None:
         finally:
             os.close(pidfd)
 
+
+_FOLLOWED_S = 0.5
 
 _AGAIN_S = 0.02
 """Neither a lock nor a socket that is yet to be made can be waited for with a deadline."""

@@ -14,7 +14,6 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, MiddlewareError
@@ -22,9 +21,9 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import supervisor_prefix, supervisor_services
 from lifecycle.measure.flows import FlowMeasurement, Pair
-from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
+from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus, timeless
 from lifecycle.supervisor.core.state import Order
-from lifecycle.supervisor.run.events import Event, Notice, Stopping, SystemReached
+from lifecycle.supervisor.run.events import Event, LogLine, Notice, Stopping, SystemReached
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import supervisor_label, takes_diagnostics
 from lifecycle.verify.verdict import FlowReport, Verdict
@@ -84,7 +83,8 @@ class RosInterface:
 
     def on_event(self, event: Event) -> None:
         """Note that there is something new to publish; a listener of the run."""
-        self._changed.set()
+        if not isinstance(event, LogLine):
+            self._changed.set()
         if isinstance(event, SystemReached) and event.reached == "active":
             self._active.set()
         self._ends = self._ends or isinstance(event, Stopping)
@@ -135,8 +135,8 @@ class RosInterface:
     def _say(self, offer: RosEntities) -> None:
         seen = self._supervisor.look()
         status = seen.status
-        if (timeless := _timeless(status)) != self._published:
-            self._published = timeless
+        if (known := timeless(status)) != self._published:
+            self._published = known
             offer.publish_status(to_json(status).decode())
         label = supervisor_label(status.system, self._machine)
         source = supervisor_prefix(status.system, self._machine)
@@ -172,25 +172,6 @@ class Reported(msgspec.Struct):
 
     flows: set[Pair] = msgspec.field(default_factory=set)
     rules: set[str] = msgspec.field(default_factory=set)
-
-
-def _timeless(status: SystemStatus) -> SystemStatus:
-    """Return a status without what changes with every second."""
-    return replace(
-        status,
-        elapsed_s=0.0,
-        nodes=tuple(
-            replace(
-                each,
-                uptime_s=None,
-                next_try_s=None,
-                cpu_s=None,
-                rss_bytes=None,
-                threads=None,
-            )
-            for each in status.nodes
-        ),
-    )
 
 
 def diagnostics(
@@ -278,8 +259,6 @@ def _of_node(node: NodeStatus, status: SystemStatus, outcome: Outcome) -> _Said:
     ]
     if node.uptime_s is not None:
         values.append(("uptime_s", f"{node.uptime_s:.1f}"))
-    if node.rss_bytes is not None:
-        values += [("cpu_s", f"{node.cpu_s:.2f}"), ("rss_bytes", str(node.rss_bytes))]
     if node.last_failure is not None:
         values.append(("last_failure", f"{node.last_failure.at}: {node.last_failure.message}"))
     return level, node.node, message, values

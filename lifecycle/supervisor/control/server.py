@@ -1,6 +1,6 @@
 """The supervisor's control socket: what `lifecycle status`, `down`, `pause` and others ask.
 
-Owns: listening, answering, and following what a supervisor knows; and `check`: of an order that
+Owns: listening and answering; and `check`: of an order that
 names a manifest, is it the one that runs, and can it be taken meanwhile? An order with a plan that
 is not the one that runs is refused unless it says to take it, and so is, with the reason, what
 cannot be changed while the supervisor runs. Which orders fit what the system is doing, and what
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import ExitCode, UsageError
@@ -25,14 +26,11 @@ from lifecycle.network.connection_url import parse
 from lifecycle.plan.build import with_files_of_now
 from lifecycle.plan.comparison import PlanDifference, changes, difference_lines
 from lifecycle.plan.model import Plan
-from lifecycle.run_directory import connect, short_path
+from lifecycle.run_directory import short_path
 from lifecycle.supervisor.control.protocol import (
-    ANSWER_S,
     Answer,
     ControlRequest,
-    Question,
     SystemStatus,
-    read_answer,
     strange,
 )
 from lifecycle.supervisor.core.change import change_to
@@ -47,7 +45,6 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 
-_BURST_S = 0.05
 _CLOSE_S = 1.0
 """In the end, a client that reads nothing for so long loses what it was not sent."""
 _LARGEST_QUESTION = 64 * 2**20
@@ -74,7 +71,6 @@ class ControlServer:
     def __init__(self, path: Path, session: Supervisor) -> None:
         self._path = path
         self._session = session
-        self._changed = asyncio.Event()
         self._server: asyncio.AbstractServer | None = None
         self._open: set[asyncio.StreamWriter] = set()
         self._waiting: set[asyncio.StreamWriter] = set()
@@ -105,8 +101,6 @@ class ControlServer:
                 if question.ask is ControlRequest.DOWN:
                     self._waiting.add(writer)
                     self._session.stop("lifecycle down", ExitCode.BRING_UP_FAILED)
-                elif question.ask is ControlRequest.FOLLOW:
-                    await self._follow(reader, writer)
                 else:
                     await _say(writer, await self._answer(question))
         except (ConnectionError, ValueError):
@@ -117,38 +111,17 @@ class ControlServer:
                 self._open.discard(writer)
                 writer.close()
 
-    def changed(self) -> None:
-        """Notify those who follow that there is something new to see."""
-        self._changed.set()
-        self._changed = asyncio.Event()
-
     async def _answer(self, question: Order) -> Answer:
+        if question.plan is not None:
+            question = replace(question, plan=self._session.system.attached(question.plan))
         if question.ask is ControlRequest.STATUS:
             differs: tuple[str, ...] = ()
             if (plan := question.plan) is not None:
                 differs = difference_lines(changes(self._session.system.first, plan))
             return Answer(status=self._session.status(), differences=differs)
         if question.ask is ControlRequest.LOOK:
-            return self._looks()
+            return Answer(look=msgspec.Raw(to_json(self._session.look())))
         return await self._session.order(question)
-
-    def _looks(self) -> Answer:
-        return Answer(look=msgspec.Raw(to_json(self._session.look())))
-
-    async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Send what is known now and after each change, until the client goes away."""
-        gone = asyncio.ensure_future(reader.read())
-        try:
-            while not gone.done():
-                changed = self._changed
-                await _say(writer, self._looks())
-                waiting = asyncio.ensure_future(changed.wait())
-                await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
-                waiting.cancel()
-                # Changes come in bursts; nothing reads pictures faster than this.
-                await asyncio.wait({gone}, timeout=_BURST_S)
-        finally:
-            gone.cancel()
 
     async def close(self, exit_code: int) -> None:
         """Answer those who asked for it that all is over, and stop listening; bounded."""
@@ -173,23 +146,6 @@ class ControlServer:
 async def _say(writer: asyncio.StreamWriter, answer: Answer) -> None:
     writer.write(to_json(answer) + b"\n")
     await writer.drain()
-
-
-def follow(path: Path) -> Iterator[SupervisorSnapshot]:
-    """Yield what the supervisor that listens at `path` knows, now and after each change.
-
-    It ends with the supervisor.
-
-    Raises:
-        TimeoutError: an answer was begun, and does not end.
-        UsageError: what answers is no supervisor of this version.
-        OSError: no supervisor listens there.
-    """
-    with connect(path, ANSWER_S) as sock:
-        sock.sendall(to_json(Question(ask=ControlRequest.FOLLOW)) + b"\n")
-        rest = bytearray()
-        while (answer := read_answer(path, sock, rest, None)) is not None:
-            yield shown(path, answer)
 
 
 def shown(path: Path, answer: Answer) -> SupervisorSnapshot:
@@ -289,12 +245,6 @@ def _check_apply(plan: Plan, system: System) -> None:
         raise _refused_whole(
             what, "a TCP port that was used is not connected to again by who used it"
         )
-    for key in (*change.restarted, *change.removed):
-        if (name := system.nodes[key].name) in system.run.adopted:
-            raise UsageError(
-                f"{what}: {name!r} would be taken down, and was adopted",
-                hint="who started it ends it; then lifecycle down, and lifecycle up",
-            )
 
 
 def _is_whole(plan: Plan) -> bool:

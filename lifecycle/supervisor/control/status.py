@@ -48,7 +48,10 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
     run, verdict = system.run, system.run.judged.verdict
     process, known = node.process, run.processes.get(node.core.process)
     runs = known is not None and known.is_alive and process is not None and process.pid != 0
-    died = _died(run, known, 0 if process is None else process.pid)
+    pid = 0 if process is None else process.pid
+    died = _died(run, known, pid)
+    if runs and node.is_destroyed:
+        died = f"destroyed by its own code; pid {pid} runs on"
     configuration = None if died else node.configuration
     flows = [
         flow
@@ -56,7 +59,6 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         if node.name in (flow.publisher, flow.subscription)
     ]
     matches = _matches(node, configuration, flows)
-    cpu_s, rss_bytes, threads = _use(process.pid) if runs and process is not None else (None,) * 3
     external = node.planned.run.kind is RunKind.ATTACH
     last = None if known is None or not known.failures else known.failures[-1]
     if last is not None:
@@ -68,7 +70,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         node=node.name,
         process="" if external else node.planned.process,
         process_state=None if known is None else process_state(run, known),
-        pid=0 if process is None else process.pid,
+        pid=pid,
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else _state(node, verdict),
@@ -93,23 +95,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         restarts=0 if known is None else known.restarts,
         last_failure=last,
         next_try_s=due_s if known is not None and known.failed and due_s > 0 else None,
-        cpu_s=cpu_s,
-        rss_bytes=rss_bytes,
-        threads=threads,
     )
-
-
-def _use(pid: int) -> tuple[float | None, int | None, int | None]:
-    """Return what a process uses: CPU time, seconds, resident bytes and threads; or nothing."""
-    import psutil  # 15 ms, which no bring-up has to wait for
-
-    try:
-        process = psutil.Process(pid)
-        with process.oneshot():
-            times = process.cpu_times()
-            return times.user + times.system, process.memory_info().rss, process.num_threads()
-    except psutil.Error:
-        return None, None, None
 
 
 def _state(node: NodeRun, verdict: Verdict | None) -> str:
@@ -157,7 +143,7 @@ def _died(run: Run, process: Process | None, pid: int) -> str:
 
 
 def system_status(system: System) -> SystemStatus:
-    """Return what is known of the whole system, with what its processes use now."""
+    """Return what is known of the whole system."""
     run, elapsed_s = system.run, system.emit.elapsed_s
     verdict = run.judged.verdict
     return SystemStatus(

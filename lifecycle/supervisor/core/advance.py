@@ -200,8 +200,6 @@ def advance(run: Run) -> list[messages.Effect]:
         messages.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
     ]
     run.outbox = []
-    if run.adopting:
-        return found
     for process in run.processes.values():
         found += _process(run, process)
     for node in run.nodes.values():

@@ -11,7 +11,6 @@ from msgspec.structs import asdict, replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import TargetState
-from lifecycle.plan.build import attached_to
 from lifecycle.plan.comparison import PlanChange, change_between, difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
@@ -203,9 +202,7 @@ def _take(run: Run, change: Change) -> None:
     stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
     run.first = plan
     gone = {key: run.nodes.pop(key) for key in change.down & run.nodes.keys()}
-    adopted = {each.key for each in plan.nodes if each.full_name in run.adopted}
-    plan = attached_to(in_mode(plan, run.mode), adopted)
-    install(run, _connected_as(plan, stays, before))
+    install(run, _connected_as(in_mode(plan, run.mode), stays, before))
     for key in gone.keys() & run.nodes.keys():  # who was kept inactive waits for a person still
         run.nodes[key].withheld, run.nodes[key].refused = gone[key].withheld, gone[key].refused
     for key in change.touched & run.nodes.keys():
@@ -213,7 +210,6 @@ def _take(run: Run, change: Change) -> None:
         if process is not None and process.state is None:
             process.restarted_by_hand()
     change.taken, change.down = True, set()
-    run.came = bool(change.touched)
     run.changed()
     until = Until.VERIFIED if run.paused else Until.ACTIVE
     run.passage = Passage(until_s=change.until_s, until=until)

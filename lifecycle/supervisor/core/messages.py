@@ -12,7 +12,6 @@ import msgspec
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, Readiness
 from lifecycle.plan.comparison import GivenParameters
-from lifecycle.plan.model import Plan
 from lifecycle.supervisor.core.state import Level, Order, Step
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
@@ -69,7 +68,7 @@ class Exited(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Swept(msgspec.Struct, frozen=True, kw_only=True):
-    """Nothing is left of a process that ended: what it started has ended, the graph forgot it.
+    """Nothing is left of a process that ended: what it started has ended, too.
 
     Attributes:
         reported: by node of others, the URLs of each of its connections, as it reports them.
@@ -182,13 +181,6 @@ class Silent(msgspec.Struct, frozen=True, kw_only=True):
     hangs: bool = False
 
 
-class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """It is known what of the system runs already: `plan` attaches to it, `nodes` by full name."""
-
-    plan: Plan
-    nodes: frozenset[str]
-
-
 class Refused(msgspec.Struct, frozen=True, kw_only=True):
     """Something was found, beside all looks, that closes the gate for good."""
 
@@ -196,20 +188,14 @@ class Refused(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Broken(msgspec.Struct, frozen=True, kw_only=True):
-    """Something failed that is no node's: the discovery server died, the fork server died.
-
-    Attributes:
-        finds: it is by what nodes find each other, and not by what they are started: those that run
-            may go on.
-    """
+    """Something failed that is no node's: the discovery server died, the fork server died."""
 
     failure: Failure
-    finds: bool = False
 
 
 Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
-    | Ordered | Stop | Silent | Adopted | Refused | Broken
+    | Ordered | Stop | Silent | Refused | Broken
 )  # fmt: skip
 
 
@@ -230,7 +216,7 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sweep(msgspec.Struct, frozen=True, kw_only=True):
-    """End what a process left, and wait until the graph has forgotten its nodes; `Swept`."""
+    """End what a process left; `Swept`."""
 
     process: str
 

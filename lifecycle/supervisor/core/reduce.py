@@ -38,7 +38,6 @@ from lifecycle.supervisor.core.state import (
     Request,
     Run,
     Step,
-    install,
 )
 from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
 from lifecycle.verify.rules.catalogue import NOT_WIRED, START_FAILED, TRANSITION_FAILED
@@ -204,8 +203,6 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     node.level = given.level
     if error:
         return _step_failed(run, node, step, error, goal)
-    if step in UP.values() and step is not Step.ACTIVATE:
-        run.came = True
     if given.already and node.base is was and not node.process and not node.planned.run.component:
         node.base = node.level  # it was found so
     process = run.processes.get(node.process)
@@ -273,13 +270,6 @@ def _tick(run: Run, given: messages.Tick) -> list[Event]:
     return events
 
 
-def _adopted(run: Run, given: messages.Adopted) -> list[Event]:
-    install(run, given.plan, own=frozenset(each.planned.process for each in run.nodes.values()))
-    run.adopting, run.adopted = False, given.nodes
-    run.changed()
-    return []
-
-
 def _refused(run: Run, given: messages.Refused) -> list[Event]:
     if run.ending is not None:
         return []
@@ -317,12 +307,8 @@ def _stop(run: Run, given: messages.Stop) -> list[Event]:
 
 
 def _broken(run: Run, given: messages.Broken) -> list[Event]:
-    run.broken = run.broken or given.finds
-    if run.ending is not None:
-        return []
-    if given.finds:
-        return failure.fail(run, given.failure)
-    run.fails_now(given.failure)
+    if run.ending is None:
+        run.fails_now(given.failure)
     return []
 
 
@@ -345,7 +331,6 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     messages.Ordered: orders.ordered,
     messages.Stop: _stop,
     messages.Silent: _silent,
-    messages.Adopted: _adopted,
     messages.Refused: _refused,
     messages.Broken: _broken,
 }

@@ -1,8 +1,7 @@
 """Drives one managed node: over our control channel, or through its lifecycle services.
 
 Owns: `NodeDriver`, of two kinds. Deadlines are the caller's: every call may be cancelled. The order
-of operations is the core's. And `adopt`, by which `lifecycle up --adopt` takes nodes that run
-already as attached before anything is started. Must not import rclpy at run time.
+of operations is the core's. Must not import rclpy at run time.
 """
 
 from __future__ import annotations
@@ -16,24 +15,14 @@ import msgspec
 
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.node.host.control import Command, Operation
-from lifecycle.plan.build import attached_to
 from lifecycle.plan.model import PlannedNode
 from lifecycle.printable import one_line
-from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.state import Step, limit_of
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.run.events import Failure, Notice
-from lifecycle.verify.judge import with_findings
 from lifecycle.verify.observation import NodeConfiguration
-from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules.catalogue import START_FAILED
-from lifecycle.verify.rules.nodes import DUPLICATE_NODE
-from lifecycle.verify.verdict import NOT_JUDGED
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-    from lifecycle.supervisor.nodes.system import System
 
 
 ACTIVE = "active"
@@ -271,57 +260,7 @@ def _failed_steps(before: str = "") -> Iterator[None]:
         raise BringUpError(f"{before}{error.message}", hint=error.hint) from error
 
 
-SETTLE_S = 5.0
-"""For discovery to show all that runs; usually it has settled within a second."""
-
 _LONGEST_COMMAND = 100
-
-
-async def adopt(
-    system: System, participant: ObserverParticipant
-) -> messages.Adopted | messages.Refused | messages.Broken:
-    """Take the nodes of a system that run already as if its manifest attached to them.
-
-    Nothing is adopted where a node runs more than once, or of a process with several nodes only
-    some run.
-    """
-    nodes, unsettled = await participant.running(SETTLE_S)
-    if unsettled:
-        system.emit(Notice(message=f"what runs may not be all that is adopted: {unsettled}"))
-    count = {each.full_name: each.count for each in nodes}
-    found = {key: node for key, node in system.nodes.items() if node.name in count}
-    twice = [
-        DUPLICATE_NODE.on(
-            each.planned,
-            outcome=Outcome.VIOLATED,
-            expected="1 node of this name",
-            observed=f"{number} nodes",
-            message=f"cannot adopt {each.name}: {number} nodes are named so",
-            hint="end all but one of them: nothing was started, and nothing asked of them",
-        )
-        for each in found.values()
-        if (number := count[each.name]) > 1
-    ]
-    if twice:
-        return messages.Refused(verdict=with_findings(NOT_JUDGED, tuple(twice), system.plan.policy))
-    for process in system.run.processes.values():
-        missing = [key for key in process.planned.nodes if key not in found]
-        if 0 < len(missing) < len(process.planned.nodes):
-            name = system.nodes[missing[0]].name
-            text = (
-                f"cannot start {name!r}: process {process.name!r} is to run it with others, which "
-                "run already; end those and all are started, or start it with them"
-            )
-            failure = Failure(rule=START_FAILED.id, subject=name, message=text)
-            return messages.Broken(failure=failure)
-    if not found:
-        system.emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
-    processes = participant.processes()
-    system.adopted = {
-        each.name: where_it_runs(processes.get(each.name, {})) for each in found.values()
-    }
-    plan = attached_to(system.plan, found)
-    return messages.Adopted(plan=plan, nodes=frozenset(system.adopted))
 
 
 def where_it_runs(processes: Mapping[int, str]) -> str:

@@ -32,6 +32,7 @@ from lifecycle.middleware.services.supervisor_topics import (
 )
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.ros_interface import Answer
+from lifecycle.supervisor.nodes.driver import where_it_runs
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import known_node
 
@@ -50,7 +51,7 @@ class ObserverParticipant:
         unknown_versions: which installed libraries are not known, and what that costs; empty if
             all are.
         announce_alive: asserts by DDS liveliness that we live.
-        watch_alive: watches the liveliness of another supervisor, or of a node that is attached.
+        watch_alive: watches the liveliness of another supervisor.
         plan_notices: takes part in the exchange of plans.
         republish_names: announces our node to the graph again.
         send_again_soon: has what waits for a link to come back be sent soon when it does.
@@ -100,10 +101,15 @@ class ObserverParticipant:
             graph.discovery.settling.within(settle_s)
         return cls(graph)
 
-    async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
-        """Return the nodes once discovery has settled, and what it lacked in the end."""
-        (nodes, _), unsettled = await settled(self.discovery, wait_s)
-        return nodes, unsettled
+    async def running(self) -> tuple[dict[str, str], str]:
+        """Return the nodes once discovery has settled, and what it lacked in the end.
+
+        By full name, with the process that each is in as people read it, empty if not known.
+        """
+        (nodes, _), unsettled = await settled(self.discovery, SETTLE_S)
+        processes = self.processes()
+        names = (each.full_name for each in nodes)
+        return {name: where_it_runs(processes.get(name, {})) for name in names}, unsettled
 
     def processes(self) -> dict[str, dict[int, str]]:
         """Return the command lines of this host's processes by full node name and pid."""
@@ -142,6 +148,9 @@ class ObserverParticipant:
     def __exit__(self, *_: object) -> None:
         self.destroy()
 
+
+SETTLE_S = 5.0
+"""For discovery to show all that runs; usually it has settled within a second."""
 
 _SETTLED_S = 0.5
 """Discovery has settled once nothing changed for so long and everything has a node."""

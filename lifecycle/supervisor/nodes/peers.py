@@ -172,7 +172,9 @@ class Peers:
             self._notices = None
         self._marks.close()
         for peer in self._supervisors:
-            _forget(peer)
+            if peer.watch is not None:
+                peer.watch.destroy()
+                peer.watch = None
         for announcement in self._announcements:
             announcement.destroy()
         self._announcements.clear()
@@ -191,7 +193,7 @@ class Peers:
     def _watch(self, peer: _Peer) -> _Peer:
         def calls(do: Callable[..., None]) -> Callable[..., None]:
             def unless_forgotten(*arguments: object) -> None:
-                if peer.watch is not None:  # else this was on its way
+                if peer.watch is not None:  # else this was on its way as it was closed
                     do(peer, *arguments)
 
             return self._in_loop(unless_forgotten)
@@ -448,9 +450,3 @@ class Peers:
             or (each.system != self._system.plan.system and {*peer.nodes} & {*each.nodes})
             for each in self._known
         )
-
-
-def _forget(peer: _Peer) -> None:
-    if peer.watch is not None:
-        peer.watch.destroy()
-        peer.watch = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from lifecycle.manifest.model import Condition, RosArguments, RunKind
 from lifecycle.measure.sample import Measured
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.node.host.control import Event as HostEvent
+from lifecycle.plan.build import attached_to, started_by_others
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.supervisor.control.protocol import Reach
@@ -61,6 +62,7 @@ class NodeRun:
         unload: has its container unload a component; None for what is not loaded into one.
         wiring: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
+        is_destroyed: its own code has destroyed it, in a process that runs on.
     """
 
     def __init__(self, system: System, core: Node) -> None:
@@ -78,6 +80,7 @@ class NodeRun:
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.wiring = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
+        self.is_destroyed = False
 
     @property
     def planned(self) -> PlannedNode:
@@ -247,7 +250,8 @@ class System:
         variables: tuple[tuple[str, str], ...] = (),
     ) -> None:
         own = tuple(processes)
-        self.run: Run = new_run(plan, options, own=frozenset(each.name for each in own))
+        self._own = frozenset(each.name for each in own)
+        self.run: Run = new_run(plan, options, own=self._own)
         self.expected = plan
         self.server: ManagedProcess | None = None
         self.emit = emit
@@ -291,6 +295,27 @@ class System:
         self.processes = {
             name: each for name, each in self.processes.items() if name in run.processes
         }
+
+    def adopt(self, running: Mapping[str, str]) -> None:
+        """Attach to the nodes that run already, before anything is begun; to no other from now on.
+
+        Args:
+            running: where each node of the graph runs, by full name.
+
+        Raises:
+            UsageError: of a process with several nodes only some run.
+        """
+        self.adopted = {name: where for name, where in running.items() if name in self._by_name}
+        if not self.adopted:
+            self.emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
+        self.expected = plan = started_by_others(self.plan, self.adopted)
+        self.run = new_run(plan, self.run.options, own=self._own)
+        self.follow()
+
+    def attached(self, plan: Plan) -> Plan:
+        """Return a plan that attaches to the nodes that were adopted, as ours does."""
+        adopted = self.adopted or ()
+        return attached_to(plan, {each.key for each in plan.nodes if each.full_name in adopted})
 
     def make_process(self, planned: PlannedProcess) -> ManagedProcess:
         """Return a process of this run, not yet started."""
@@ -339,13 +364,6 @@ class System:
                 found[node.name] = process.end.text
         return found
 
-    def dead(self) -> frozenset[str]:
-        """Return the names of the nodes whose process has ended.
-
-        Discovery shows them until their lease runs out.
-        """
-        return frozenset(node.name for node in self.nodes.values() if node.is_gone)
-
     def _is_there(self, name: str) -> bool:
         """Whether a node has started, and is in the graph as far as that is known."""
         node = self._by_name.get(name)
@@ -377,6 +395,8 @@ class System:
             if node.configuration is not None:  # the next look has it
                 node.configuration = replace(node.configuration, measured=event.measured)
             return
+        if event.kind == "destroyed":
+            node.is_destroyed = True
         if event.configuration is not None:
             node.configuration = event.configuration
         if event.kind != "reply" and event.state:

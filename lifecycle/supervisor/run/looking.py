@@ -31,13 +31,13 @@ from lifecycle.plan.discovery import reached_hosts
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, run_roots, running, runtime_root
 from lifecycle.supervisor.connections.instructions import expected_by_onlooker, is_negotiated
-from lifecycle.supervisor.control.protocol import look
-from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
+from lifecycle.supervisor.control.protocol import follow, look
+from lifecycle.supervisor.control.server import SupervisorSnapshot
 from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.nodes.liveliness import ANSWER_S, TRIES, not_answering
 from lifecycle.supervisor.processes.process import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.supervisor.shell.settling import GracePeriod
+from lifecycle.supervisor.shell.settling import Passing
 from lifecycle.verify.judge import apart_from_numbers, verify, with_findings, with_measured
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
@@ -54,11 +54,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _ASK_AGAIN_S = 0.5
-"""Nodes are asked again so long after: their matched counts change without a graph change ..."""
+"""Nodes are asked again so long after: their matched counts change without a graph change."""
 
-_ASK_AT_MOST_S = 8.0
-"""... a moment after one, so an outside observer asks half as often each time, down to this: it is
-not notified that a node hangs or was reconfigured."""
+_EACH_S = 1.0
+"""Who follows a system looks at it so often."""
 
 
 class JudgedSystem(msgspec.Struct, frozen=True, kw_only=True):
@@ -119,7 +118,8 @@ def judge_running(
             if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
                 unanswered = await _unanswering(plan, observation, participant)
                 return _judged(plan, observation, participant, unanswered=unanswered)
-            await _change(participant, min(left_s, _ASK_AGAIN_S))
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(participant.graph.wait_change(), min(left_s, _ASK_AGAIN_S))
 
     return asyncio.run(_with_participant(plan, judge))
 
@@ -136,49 +136,29 @@ def with_supervisors_numbers(seen: JudgedSystem) -> JudgedSystem:
 
 
 def follow_running(
-    plan: Plan,
-    on_change: Callable[[JudgedSystem], None],
-    *,
-    each_s: float | None = None,
-    for_s: float | None = None,
+    plan: Plan, on_change: Callable[[JudgedSystem], None], *, each_s: float | None = None
 ) -> None:
     """Judge what runs whenever it changes, and give it to `on_change`, until interrupted.
 
-    What may pass by itself is given a moment to do so, see `GracePeriod`.
+    What may pass by itself is given a moment to do so, see `Passing`.
 
     Args:
         plan: what should run.
         on_change: takes what was seen.
         each_s: seconds, > 0, after which what is measured is a change; None if it never is.
-        for_s: seconds, > 0, after which to end; None follows for ever.
     """
 
     async def follow(participant: ObserverParticipant) -> None:
-        grace_period = GracePeriod()
+        passing, clock = Passing(), asyncio.get_running_loop().time
         last: JudgedSystem | None = None
-        clock = asyncio.get_running_loop().time
-        until_s = clock() + (float("inf") if for_s is None else for_s)
-        pause_s = _ASK_AGAIN_S
         while True:
             seen = _judged(plan, await participant.graph.observe(plan), participant)
-            before = None if last is None else last.verdict
-            verdict, again_s = grace_period.after(before, seen.verdict, seen.plan, clock())
+            verdict, _ = passing.without(seen.verdict, seen.plan, clock(), stage=Stage.ACTIVE)
             seen = replace(seen, verdict=verdict)
-            is_other = last is None or _apart_from_numbers(seen) != _apart_from_numbers(last)
-            measures = each_s is not None and bool(verdict.measured)
-            last = seen
-            if is_other or measures:
+            before, last = last, _apart_from_numbers(seen)
+            if last != before or (each_s is not None and verdict.measured):
                 on_change(seen)
-            if is_other or again_s is not None:
-                pause_s = _ASK_AGAIN_S
-            left_s = until_s - clock()
-            if left_s <= 0:
-                return
-            if each_s is not None and measures:
-                await asyncio.sleep(min(each_s, left_s))
-            else:
-                changed = await _change(participant, min(pause_s, left_s))
-                pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
+            await asyncio.sleep(each_s or _EACH_S)
 
     asyncio.run(_with_participant(plan, follow))
 
@@ -301,15 +281,6 @@ def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
     return any(heals)
 
 
-async def _change(observer_participant: ObserverParticipant, timeout_s: float) -> bool:
-    """Wait for a change of the graph; False when it is time to ask the nodes again without one."""
-    try:
-        await asyncio.wait_for(observer_participant.graph.wait_change(), timeout_s)
-    except asyncio.TimeoutError:
-        return False
-    return True
-
-
 def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> Path | None:
     """Return the run directory of the supervisor of a plan on this host; None without one."""
     path = runtime_root(environment) / run_name(plan, machine)
@@ -317,13 +288,9 @@ def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> P
 
 
 def supervised_pictures(path: Path) -> Iterator[Picture]:
-    """Yield what a supervisor sees, again whenever it differs, until the supervisor ends.
-
-    Raises:
-        OSError: no supervisor listens there.
-    """
+    """Yield what a supervisor sees, again whenever it differs, until the supervisor ends."""
     last: Picture | None = None
-    for seen in follow(path / "control"):
+    for seen in follow(path):
         picture = picture_of(seen)
         if picture != last:
             last = picture
@@ -356,7 +323,6 @@ def capture_running(
     system: str,
     domain_id: int,
     discovery_range: DiscoveryRange,
-    namespaces: tuple[str, ...],
     wait_s: float,
     attach: bool,
 ) -> CapturedSystem:
@@ -366,7 +332,6 @@ def capture_running(
         system: name to give it.
         domain_id: 0–232.
         discovery_range: how far to look.
-        namespaces: take only nodes in or below one of these; empty takes all.
         wait_s: seconds, > 0, that discovery may take to settle.
         attach: do not look how the processes of this host were started.
 
@@ -407,7 +372,6 @@ def capture_running(
                 system=system,
                 domain_id=domain_id,
                 discovery_range=discovery_range,
-                namespaces=namespaces,
                 unsettled=unsettled,
                 programs=note_ended(programs),
             )

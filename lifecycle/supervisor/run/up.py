@@ -42,7 +42,7 @@ from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.middleware.rcl.conversions import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.discovery import reached_hosts
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.run_directory import (
     FORK_SERVER,
     RunDirectory,
@@ -138,8 +138,7 @@ def up(
     emit = Emitter()
     emit.listen(_guarded(listener, raised))
     emit.listen(service.on_event)
-    python = (each for each in processes if each.run.kind is RunKind.PYTHON)
-    nodes = (plan.node(key) for each in python for key in each.nodes)
+    nodes = (plan.node(key) for each in processes if _hosted(each) for key in each.nodes)
     process.preload(dict.fromkeys(each.type for node in nodes for each in node.endpoints))
     logs = log_directory(os.environ, plan.system)
     directory = RunDirectory.acquire(
@@ -179,6 +178,7 @@ def up(
                     await discovery_server.begin(system, fork_server)
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
+                await _adopt(system, observer_participant)
                 emit(
                     RunStarted(
                         system=plan.system,
@@ -221,6 +221,10 @@ def up(
     if raised:
         raise raised[0]
     return result
+
+
+def _hosted(process: PlannedProcess) -> bool:
+    return process.run.kind is RunKind.PYTHON
 
 
 def _guarded(listener: Listener, raised: list[Exception]) -> Listener:
@@ -332,6 +336,16 @@ async def _observer_participant(
     return observer_participant
 
 
+async def _adopt(system: System, observer_participant: ObserverParticipant) -> None:
+    if not system.run.options.adopt:
+        return
+    running, unsettled = await observer_participant.running()
+    if unsettled:
+        text = f"what runs may not be all that is adopted: {unsettled}"
+        system.emit(Notice(message=text))
+    system.adopt(running)
+
+
 _GRAPH_VARIABLES = (
     "ROS_DOMAIN_ID",
     RANGE_VARIABLE,
@@ -363,8 +377,8 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     check_threads(THREADS)
     from lifecycle.middleware.fastdds.factory import refuse_unsupported
 
-    hosted = (each for each in plan.processes if each.run.kind is RunKind.PYTHON)
-    refuse_unsupported(plan.node(k) for each in hosted if each.machine in own for k in each.nodes)
+    hosted = (each for each in plan.processes if _hosted(each) and each.machine in own)
+    refuse_unsupported(plan.node(key) for each in hosted for key in each.nodes)
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ[RANGE_VARIABLE] = plan.discovery_range.name
     hosts = reached_hosts(plan, own)

@@ -18,24 +18,22 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition, EndpointKind
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.liveliness import arrivals
 from lifecycle.supervisor.nodes.system import reached
 from lifecycle.supervisor.processes.process import unlimited
-from lifecycle.supervisor.shell.settling import GracePeriod, Standstill
-from lifecycle.verify.judge import verify, with_findings, without_findings, without_measured
+from lifecycle.supervisor.shell.settling import Passing, Standstill
+from lifecycle.verify.judge import verify, with_findings, without_measured
 from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation, shown
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
-from lifecycle.verify.rules.matching import UNKNOWN_PEER
 from lifecycle.verify.rules.measured import decided_by_clocks
 from lifecycle.verify.rules.state import UNHEALTHY, health_of
 from lifecycle.verify.tool_filter import PREFIX_DIGITS
-from lifecycle.verify.verdict import FindingKey, Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.core.state import Passage
@@ -66,11 +64,6 @@ its announcer may not be matched yet."""
 SHOWN_S = 0.5
 """The graph shows the state of a node of others within so long after it changed."""
 
-
-DISCOVERED_S = 3.5
-"""A participant whose first announcements were lost is discovered with the next one, after 3 s by
-default: a node of ours may be matched with it for so long before our participant knows it."""
-
 HEALTH_S = 5.0
 """Who publishes its health does so within this time, or it counts as stale (graph/graph.py): a
 node that must be healthy, and has not said how it is, is waited for no longer."""
@@ -90,8 +83,8 @@ class Looks:
         self._shell = shell
         self._system = shell.system
         self._graph = shell.means.participant.graph
-        self._grace_period = GracePeriod()
-        self._latest: Verdict | None = None
+        self._passing = Passing()
+        self._judged = False
         self._was_stale = False
         self._again_s = ASK_AGAIN_S
         self._asked: Passage | None = None
@@ -101,11 +94,8 @@ class Looks:
         self._stills = 0
         self._decided: frozenset[object] = frozenset()  # by clocks, as they were confirmed
         self.seen = Observation()
-        self._unsaid: dict[str, float] = {}
-        self._unknown_peers: dict[FindingKey, float] = {}  # since when each is found
         # Nodes that are not our hosts' and their participants' prefixes, and since when.
         self._active: dict[tuple[str, str], float] = {}
-        self._passing_s = NEVER_S  # until one of what is found may not pass any more
 
     @property
     def is_behind(self) -> bool:
@@ -123,7 +113,7 @@ class Looks:
         # While an open gate lets one level of nodes through after the other, each is looked at at
         # once; what the last of them report is on the way.
         passes = run.held_s is None and gate.allows(run) and not self._was_stale
-        if self._latest is not None and not (passes and advance.stage_of(run) is Stage.CONNECTED):
+        if self._judged and not (passes and advance.stage_of(run) is Stage.CONNECTED):
             until_s = loop.time() + BURST_S
             while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
                 pass
@@ -158,20 +148,20 @@ class Looks:
         self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
     ) -> messages.Verified:
         run, authority = self._system.run, self._shell.authority
-        now_s = asyncio.get_running_loop().time()
-        verdict, awaited_s, again_s = found, list[float](), [self._passing_s]
+        now_s, self._judged = asyncio.get_running_loop().time(), True
         watched = run.held_s is not None and run.asked is None and run.opening is None
-        if watched:
-            verdict, kept_s = self._grace_period.after(
-                self._latest, found, self._system.expected, now_s
-            )
-            awaited_s += [] if kept_s is None else [kept_s]
-            if run.plan.bounds and stage is Stage.ACTIVE:
-                again_s.append(MEASURED_S if run.decided_s is not None else SLOT_S)
-        self._latest = verdict
-        closes = gate.closes(found, strict=run.options.strict)
-        if not closes and stage is Stage.CONNECTED and (left_s := self._unsaid_s(found)) > 0:
-            awaited_s.append(left_s)
+        verdict, passes_s = self._passing.without(
+            found, self._system.expected, now_s, stage=stage, watched=watched
+        )
+        awaited_s = [passes_s] if watched and verdict is not found else []
+        again_s = [passes_s]
+        if watched and run.plan.bounds and stage is Stage.ACTIVE:
+            again_s.append(MEASURED_S if run.decided_s is not None else SLOT_S)
+        if not gate.closes(found, strict=run.options.strict) and stage is Stage.CONNECTED:
+            # Who says nothing for so long is taken on trust, if the policy allows it.
+            unsaid = (each for each in found.findings if each.rule == UNHEALTHY.id)
+            left_s = (self._passing.since_s(each) + HEALTH_S - now_s for each in unsaid)
+            awaited_s += [each for each in left_s if each > 0]
         if self._asks_again(found):
             if run.asked is not self._asked:
                 self._asked, self._again_s = run.asked, ASK_AGAIN_S
@@ -202,8 +192,7 @@ class Looks:
         system = self._system
         await system.refresh(self._graph, marks=stage is Stage.CONNECTED)
         awake = {each.full_name for each in system.plan.nodes} - system.liveliness.silent.keys()
-        seen = await self._graph.observe(system.plan, only=awake, machines=system.machines)
-        observation = without(seen, system.dead())
+        observation = await self._graph.observe(system.plan, only=awake, machines=system.machines)
         run = system.run
         is_measured = run.held_s is not None and run.passage is None
         if is_measured:
@@ -237,15 +226,13 @@ class Looks:
         # Where nothing is declared, hosts do not report what they count.
         if not is_measured or not (expected.bounds or observation.marks):
             verdict = without_measured(verdict, expected.policy)
-        verdict = self._without_passing_peers(verdict, stage)
         limits = unlimited(each.planned for each in system.run.processes.values())
         wiring = () if self._shell.authority is None else self._shell.authority.findings()
         verdict = with_findings(
             verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
         )
         verdict = self._shell.peers.explained(verdict)
-        more = (*self._shell.peers.findings(observation), *discovery_server.findings(system))
-        return with_findings(verdict, more, expected.policy)
+        return with_findings(verdict, self._shell.peers.findings(observation), expected.policy)
 
     def _with_activity(self, observation: Observation) -> Observation:
         """Return what was seen, with how long nodes are seen to be active that are not our hosts'.
@@ -272,37 +259,6 @@ class Looks:
             since_s[name] = max(seen_s, since_s.get(name, seen_s))
         times = tuple((name, now_s - each) for name, each in since_s.items())
         return replace(observation, active_s=times)
-
-    def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
-        """Return a verdict without peers that the graph cannot explain yet.
-
-        Behind the gate a newcomer has DISCOVERED_S to be discovered.
-        """
-        now_s = asyncio.get_running_loop().time()
-        found = {each.key: each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
-        self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
-        may_pass_s = DISCOVERED_S if stage is Stage.ACTIVE else 0.0
-        until_s = {key: since_s + may_pass_s for key, since_s in self._unknown_peers.items()}
-        passing = {key: at for key, at in until_s.items() if at > now_s}
-        self._passing_s = min(passing.values(), default=NEVER_S) - now_s
-        if not passing:
-            return verdict
-        dropped = [found[key] for key in passing]
-        return without_findings(verdict, dropped, self._system.expected.policy)
-
-    def _unsaid_s(self, verdict: Verdict) -> float:
-        """Return for how long the health is waited for of nodes that have not said how they are.
-
-        Once for each: who says nothing for so long is taken on trust, if the policy allows it.
-        """
-        now_s = asyncio.get_running_loop().time()
-        unsaid = {
-            each.node
-            for each in verdict.findings
-            if each.rule == UNHEALTHY.id and each.outcome is Outcome.UNVERIFIABLE
-        }
-        self._unsaid = {node: self._unsaid.get(node, now_s) for node in unsaid}
-        return max((since + HEALTH_S - now_s for since in self._unsaid.values()), default=0.0)
 
     def _asks_again(self, verdict: Verdict) -> bool:
         """Whether something is missing that nobody would report once it is there.
@@ -357,7 +313,6 @@ class Looks:
         `began`: the processes when the look began: of one that has died since it shows nothing.
         """
         nodes, awaited = self._system.nodes, self._system.plan.awaited
-        seen = without(seen, self._system.dead())
         states = {each.full_name: each.state for each in seen.nodes}
         own = {each.name: own_health(each) for each in seen.configurations}
         published = {each.full_name: each.health for each in seen.nodes}
@@ -397,27 +352,6 @@ class Looks:
             self._activated_s[key] = now_s
             asyncio.get_running_loop().call_later(SHOWN_S, self._system.touch)
         return is_news
-
-
-def without(observation: Observation, dead: frozenset[str]) -> Observation:
-    """Return `observation` without the ghosts of dead nodes; a second node of the name stays."""
-    if not dead:
-        return observation
-    alive = {
-        node.full_name for node in observation.nodes if node.full_name in dead and node.count > 1
-    }
-    gone = dead - alive
-    return replace(
-        observation,
-        nodes=tuple(
-            replace(node, count=node.count - 1) if node.full_name in alive else node
-            for node in observation.nodes
-            if node.full_name not in gone
-        ),
-        endpoints=tuple(each for each in observation.endpoints if each.node not in gone),
-        configurations=tuple(each for each in observation.configurations if each.name not in gone),
-        parameters=tuple(each for each in observation.parameters if each.node not in gone),
-    )
 
 
 def own_health(report: NodeConfiguration | None) -> HealthReport | None:

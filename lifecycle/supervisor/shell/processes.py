@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
-from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.run_directory import FORK_SERVER, start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -31,9 +29,6 @@ if TYPE_CHECKING:
 
 _WORDS_S = 0.1
 """For what a process wrote to its channel just before it ended."""
-
-_AGAIN_S = 0.2
-"""What ended processes left is forgotten bit by bit, and not all of it is a change of the graph."""
 
 
 class Processes:
@@ -175,7 +170,7 @@ class Processes:
             process.signal(effect.number)
 
     async def sweep(self, effect: messages.Sweep) -> None:
-        """End what a process left, and wait until the graph shows none of its nodes any more."""
+        """End what a process left."""
         system, fork_server = self._system, self._means.fork_server
         process = system.processes[effect.process]
         carried = system.carried_by(effect.process)
@@ -186,12 +181,9 @@ class Processes:
                 pids = ", ".join(map(str, left))
                 text = f"ended what {process.name!r} left behind: {pids}"
                 system.emit(Notice(message=text))
-            for node in carried:
-                self._means.participant.graph.drop_configuration(node.name)
             for pid in {*left, *known}:
                 if start_ticks(pid) is None:
                     self.forget(pid, carried)
-            await asyncio.gather(*(self._vanishes(node.name) for node in carried))
         names = {each.name for each in system.nodes.values()}
         self._shell.again |= {node.name for node in carried}
         self._shell.give(
@@ -213,16 +205,8 @@ class Processes:
             nodes=[node.name for node in nodes],
             reported=[prefix for node in nodes for prefix in _reported(node)],
         )
-
-    async def _vanishes(self, name: str) -> None:
-        """Wait until discovery shows no node of this name, or its lease must have run out."""
-        loop = asyncio.get_running_loop()
-        until_s = loop.time() + FORGOTTEN_S
-        while self._system.run.ending is None and (left_s := until_s - loop.time()) > 0:
-            changed = self._shell.changed
-            if name not in await self._shell.seen():
-                return
-            await set_within(changed, min(left_s, _AGAIN_S))
+        for node in nodes:
+            self._means.participant.graph.drop_configuration(node.name)
 
 
 def _reported(node: NodeRun) -> Iterable[str]:

@@ -1,7 +1,7 @@
 """What a verdict must not be misled by: what passes by itself, and that we stood still.
 
-Owns: `GracePeriod`: the facts of one change arrive one by one, and a verdict that is worse by what
-is not known yet alone is kept back for a moment. The gate itself has no grace period. And
+Owns: `Passing`: the facts of one change arrive one by one, and what is not known yet alone is kept
+back for a moment. The gate itself has no grace period. And
 `Standstill`: this process was stopped or frozen, or its machine slept. What arrives meanwhile waits
 in the kernel, and the middleware needs a moment to take it in: no verdict of before is one of now.
 """
@@ -14,19 +14,25 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.core.state import NEVER_S
+from lifecycle.verify.judge import without_findings
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.endpoints import DEFINITION_DIFFERS, UNATTRIBUTED_ENDPOINT
-from lifecycle.verify.rules.matching import SERVER_OF
+from lifecycle.verify.rules.matching import SERVER_OF, UNKNOWN_PEER
 from lifecycle.verify.rules.nodes import UNDECLARED_NODE
 from lifecycle.verify.rules.parameters import SILENT_CLOCK
 from lifecycle.verify.tool_filter import is_hidden_node
-from lifecycle.verify.verdict import Finding, FindingKey, Verdict
+from lifecycle.verify.verdict import Finding, FindingKey, Stage, Verdict
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
+
+DISCOVERED_S = 3.5
+"""A participant whose first announcements were lost is discovered with the next one, after 3 s by
+default: a node of ours may be matched with it for so long before our participant knows it."""
 
 _BEAT_S = 0.1
 STILL_S = 0.25
@@ -35,55 +41,63 @@ STILL_S = 0.25
 _Place = tuple[object, ...]
 
 
-class GracePeriod:
-    """Knows since when something that may pass is wrong.
+class Passing:
+    """Leaves out of verdicts what may pass by itself, for as long as it may.
 
-    Two kinds of findings may: an endpoint whose node is not known (yet), with what is not known of
-    it for that reason; and whatever concerns an endpoint, a connection or a flow that must be there
-    only since a moment ago, because the authority has just decided so.
+    That is an endpoint whose node is not known (yet), with what is not known of it for that reason;
+    whatever concerns an endpoint, a connection or a flow that must be there only since a moment
+    ago, because the authority has just decided so; and a peer that only its match shows.
     """
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self._demands: frozenset[tuple[_Place, str]] = frozenset()
-        self._since: dict[_Place, float] = {}
-        self._unknown: dict[FindingKey, float] = {}
+        self._demanded_s: dict[_Place, float] = {}
+        self._since_s: dict[FindingKey, float] = {}
 
-    def after(
-        self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
-    ) -> tuple[Verdict, float | None]:
-        """Return the verdict that holds, and in how many seconds to judge again, if at all.
+    def without(
+        self, verdict: Verdict, expected: Plan, now_s: float, *, stage: Stage, watched: bool = True
+    ) -> tuple[Verdict, float]:
+        """Return the verdict that holds, and in how many seconds to judge again.
 
-        `last` held so far; None before the first.
+        While it is not `watched` only peers that are not known yet may pass, behind the gate.
         """
-        self._unknown = {
-            each.key: self._unknown.get(each.key, now_s)
-            for each in verdict.findings
-            if _is_of_unknown_node(each)
-        }
+        since_s = {each.key: self._since_s.get(each.key, now_s) for each in verdict.findings}
+        self._since_s = since_s
         if expected is not self._plan:
             demands = frozenset(_demands(expected))
             if self._plan is not None:
-                self._since |= {place: now_s for place, _ in demands - self._demands}
+                self._demanded_s |= {place: now_s for place, _ in demands - self._demands}
             self._plan, self._demands = expected, demands
-        known = set() if last is None else {each.key for each in last.findings}
-        worse = [each for each in verdict.findings if each.key not in known]
-        if last is None or not worse or known - {each.key for each in verdict.findings}:
-            return verdict, None
-        left_s = min(map(self._passes_s, worse)) - now_s
-        return (last, left_s) if left_s > 0 else (verdict, None)
+        left_s = {
+            each.key: self._passes_s(each, stage, watched=watched) - now_s
+            for each in verdict.findings
+        }
+        passing = [each for each in verdict.findings if left_s[each.key] > 0]
+        if not passing:
+            return verdict, NEVER_S
+        verdict = without_findings(verdict, passing, expected.policy)
+        return verdict, min(left_s[each.key] for each in passing)
 
-    def _passes_s(self, finding: Finding) -> float:
+    def since_s(self, finding: Finding) -> float:
+        """Return since when something is found that was so at the latest look."""
+        return self._since_s[finding.key]
+
+    def _passes_s(self, finding: Finding, stage: Stage, *, watched: bool) -> float:
         """Return until when a finding may pass; -inf if it may not."""
-        if finding.key in self._unknown:
-            return self._unknown[finding.key] + PASSING_S
+        if finding.rule == UNKNOWN_PEER.id and stage is Stage.ACTIVE:
+            return self._since_s[finding.key] + DISCOVERED_S
+        if not watched:
+            return float("-inf")
+        if _is_of_unknown_node(finding):
+            return self._since_s[finding.key] + PASSING_S
         places: list[_Place] = [
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
         ]
         if rule(finding.rule).about is About.CONNECTION:
             places.append(("connection", finding.node))
-        return max(self._since.get(place, float("-inf")) for place in places) + PASSING_S
+        return max(self._demanded_s.get(place, float("-inf")) for place in places) + PASSING_S
 
 
 def _is_of_unknown_node(finding: Finding) -> bool:

@@ -33,15 +33,12 @@ from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import STARTS, refused_at_once
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.nodes.driver import adopt
 from lifecycle.supervisor.nodes.liveliness import Answering, Cause
 from lifecycle.supervisor.nodes.peers import FAILED, Peers
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.fork_server import reap_adopted
 from lifecycle.supervisor.run.events import (
-    Event,
     Failure,
-    LogLine,
     Notice,
     ProcessChanged,
     Stopped,
@@ -178,7 +175,6 @@ class Supervisor:
         if order.ask is ControlRequest.APPLY and order.plan is not None:
             what = change_to(run, order.plan)
             change = changed_nodes(what, run.first, order.plan, run.revision)
-        order = replace(order, first=run.first)
         code, why = refused_at_once(run, order)
         if change is not None and order.dry_run:
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
@@ -226,8 +222,6 @@ class Supervisor:
         self._say_states()
         for event in events:
             self._emit(event)
-        if isinstance(given, messages.Verified) and given.verdict.measured:
-            self._server.changed()  # other numbers alone are no event
         self._requests.drop()
         wanted = advance.advance(run)
         self._say_states()
@@ -409,10 +403,6 @@ class Supervisor:
             error = failed.message
         self.give(messages.Programmed(number=effect.number, error=error))
 
-    async def _adopt(self) -> None:
-        """Take what runs already as it is found, before anything is started."""
-        self.give(await adopt(self.system, self.means.participant))
-
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
         text = f"cannot go on: {text}"
@@ -422,7 +412,7 @@ class Supervisor:
     async def _watch_discovery_server(self) -> None:
         if (server := self.system.server) is not None:
             found = discovery_server.death(server, await asyncio.shield(server.ended))
-            self.give(messages.Broken(failure=found, finds=True))
+            self.give(messages.Broken(failure=found))
 
     # From begin to end
 
@@ -431,12 +421,7 @@ class Supervisor:
         await self._server.open()
         self.peers.open()
 
-        def changed(event: Event) -> None:
-            if not isinstance(event, LogLine):
-                self._server.changed()
-                self._ros_interface.on_event(event)
-
-        self._emit.listen(changed)
+        self._emit.listen(self._ros_interface.on_event)
         self.start(self._ros_interface.follow())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [
@@ -453,8 +438,6 @@ class Supervisor:
             each.add_done_callback(self._done)
         try:
             with self._signals():
-                if self.system.run.adopting:
-                    self.start(self._adopt())
                 self.give(messages.Tick())
                 try:
                     await self._over.wait()

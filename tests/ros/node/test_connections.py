@@ -33,7 +33,7 @@ from lifecycle.verify.observation import NodeConfiguration
 Active = Callable[..., Any]
 STRICT = UniqueRequirement.STRICTLY_REQUIRED
 UDP = "udpv4://127.0.0.1"
-OTHER_UDP = "udpv4://127.0.0.1?max_datagram_bytes=1400"
+OTHER_UDP = "udpv4://127.0.0.1?ttl=2"
 RELIABLE = QoSProfile(depth=1000)
 """More than is sent while a busy machine keeps a receiving thread waiting."""
 

@@ -173,6 +173,32 @@ class Listener(LifecycleNode):
             print(f"heard {message.data}", flush=True)
 
 
+class Leaving(LifecycleNode):
+    """Destroys itself a moment after it was activated; its process goes on."""
+
+    async def leave(self) -> None:
+        await self.sleep(0.2)
+        self.destroy_node()
+
+    def on_activate(self) -> None:
+        self.executor.create_task(self.leave)
+
+
+class Crossing(LifecycleNode):
+    """Hears of several topics, and publishes some of its own."""
+
+    @on_message("in0")
+    @on_message("in1")
+    @on_message("in2")
+    @on_message("in3")
+    @on_message("in4")
+    @on_message("in5")
+    @on_message("in6")
+    @on_message("in7")
+    def heard(self, message: String) -> None:
+        pass
+
+
 class Quiet(LifecycleNode):
     """Has what its manifest declares, and does nothing with it."""
 

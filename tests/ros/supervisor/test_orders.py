@@ -203,7 +203,6 @@ def test_a_panel_on_the_network_pauses_and_ends_the_system_where_it_may(
         assert panel.call("resume") == (True, "active")
         success, status = panel.call("get_status")
         assert (success, json.loads(status)["verdict"]) == (True, "ok")
-        assert all(each["rss_bytes"] > 2**20 for each in json.loads(status)["nodes"])
         talker, listener = (Path(f"/proc/{run.pid_of(each)}") for each in ("talker", "listener"))
         assert "NoNewPrivs:\t1" in (talker / "status").read_text()
         assert "NoNewPrivs:\t0" in (listener / "status").read_text()

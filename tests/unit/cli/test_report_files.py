@@ -190,7 +190,6 @@ def test_every_end_is_reported_and_none_of_these_is_a_success(
     elif suffix == "xml":
         root = ET.fromstring(text)
         assert [each.get("message") for each in root.iter("failure")] == [reason]
-        assert {len(each) for each in root.iter("testcase")} == {0, 1}
     elif suffix == "sarif":
         (run,) = json.loads(text)["runs"]
         assert run["invocations"][0]["exitCode"] == code

@@ -137,7 +137,7 @@ def test_ways_to_run(every_key: Manifest) -> None:
     assert _node(every_key, "talker").run == Run(
         kind=RunKind.PYTHON,
         python="demo.nodes:Talker",
-        environment=(("LANG", "C"), ("LEVEL", "3"), ("VERSION", "1.10")),
+        environment={"LANG": "C", "LEVEL": "3", "VERSION": "1.10"},
         working_directory=str(VALID),
         no_new_privileges=True,
         limits=Limits(as_mib=4096, cpu_sec=3600, nofile=1024, nproc=4096),
@@ -226,7 +226,6 @@ def test_endpoints(every_key: Manifest) -> None:
         (EndpointKind.SERVICE_SERVER, "~/mute", "std_srvs/srv/SetBool"),
         (EndpointKind.SERVICE_CLIENT, "/other/reset", "std_srvs/srv/Trigger"),
     ]
-    assert interface.source == ""
     assert [each.qos for each in interface.endpoints[1:]] == [
         PRESETS["default"],
         PRESETS["services_default"],
@@ -330,7 +329,7 @@ def test_substitutions_take_the_type_that_the_place_needs(monkeypatch: pytest.Mo
     assert camera.namespace == "/r2/left"
     assert not camera.managed
     assert camera.run.command == ("sh", "-c", "exec camera --left $(date)")
-    assert camera.run.environment == (("SIDE", "left"), ("EMPTY", ""))
+    assert camera.run.environment == {"SIDE": "left", "EMPTY": ""}
     assert dict(camera.parameters) == {
         "number": 42,
         "text": "42",
@@ -412,9 +411,8 @@ def test_yaml_1_2_scalars_reach_parameters_as_they_are(monkeypatch: pytest.Monke
     ]
 
 
-def test_an_interface_by_reference_names_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interface_by_reference_is_that_of_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
     (talker,) = _corpus("interface_by_reference", monkeypatch).nodes
-    assert talker.interface.source == "local://parts/talker.nodl.yaml"
     assert [each.name for each in talker.interface.endpoints] == ["chatter"]
     assert [each.name for each in talker.interface.parameters] == ["rate"]
 

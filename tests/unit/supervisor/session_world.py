@@ -40,6 +40,7 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
 )
 from lifecycle.supervisor.control.ros_interface import Entry
+from lifecycle.supervisor.nodes.driver import where_it_runs
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
     Event,
@@ -227,7 +228,12 @@ class FakeParticipant(FakeAir):
         del machines
         self.looks += 1
         self.asked = [each.key for each in plan.nodes if only is None or each.full_name in only]
-        hosted = [name for names in self._hosts.nodes.values() for name in names]
+        hosted = [
+            name
+            for process, names in self._hosts.nodes.items()
+            if self._hosts.processes[process].pid not in self.forgotten
+            for name in names
+        ]
         there = {name: "" for name in hosted if name not in self.unseen} | self.others
         seen = Observation(
             nodes=tuple(
@@ -244,13 +250,6 @@ class FakeParticipant(FakeAir):
             self.while_looking = None
             happens()
         return seen
-
-    async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
-        del wait_s
-        found = (
-            ObservedNode(full_name=name, count=1 + (name in self.twice)) for name in self.others
-        )
-        return tuple(found), ""
 
     def processes(self) -> dict[str, dict[int, str]]:
         return {name: {pid: "by hand"} for name, pid in self.pids.items()}
@@ -513,6 +512,10 @@ class SessionWorld(World):
                 networks=FakeNetworks(self.hosts),
                 ending=self.ending,
             )
+            if self.system.run.options.adopt:
+                processes = self.graph.processes()
+                found = {name: processes.get(name, {}) for name in self.graph.others}
+                self.system.adopt({name: where_it_runs(each) for name, each in found.items()})
             session = self.supervisor = Supervisor(self.system, means)
             self.prepare()
             self.status = session.status

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Condition, RunKind, TargetState
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
@@ -105,40 +105,11 @@ async def test_where_nothing_may_be_activated_it_is_judged_and_left_as_it_was_fo
     assert world.graph.others == found
 
 
-async def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_asked(
-    tmp_path: Path,
-) -> None:
-    world = world_of(tmp_path)
-    world.graph.twice = {"/new"}
-    await world.run()
-    assert world.outline == [
-        "[verdict] connected violated graph.duplicate-node /new",
-        "[stopping] at 0.0 s: the verdict keeps the gate closed",
-        *over(4),
-    ]
-    assert world.messages == ["cannot adopt /new: 2 nodes are named so"]
-    assert world.report == (
-        "ended before it was connected, exit code 4: the verdict keeps the gate closed; "
-        "wrong: /new (graph.duplicate-node)"
-    )
-
-
 async def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: Path) -> None:
     plan = plan_of(planned_node("lidar", process="both"), planned_node("new", process="both"))
     world = world_of(tmp_path, plan)
-    del world.graph.others["/new"]
-    await world.run()
-    assert world.outline == [
-        "[failure] run.start-failed /new",
-        "[stopping] at 0.0 s: rolling back",
-        *over(6),
-    ]
-    assert world.messages == [
-        (
-            "cannot start '/new': process 'both' is to run it with others, which run already; "
-            "end those and all are started, or start it with them"
-        )
-    ]
+    with pytest.raises(UsageError, match="cannot leave out 'lidar' alone"):
+        world.system.adopt({"/lidar": ""})
 
 
 async def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:

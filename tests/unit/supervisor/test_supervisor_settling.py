@@ -7,7 +7,8 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
-from lifecycle.supervisor.shell.settling import PASSING_S, GracePeriod
+from lifecycle.supervisor.core.state import NEVER_S
+from lifecycle.supervisor.shell.settling import PASSING_S, Passing
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage, Verdict
@@ -68,12 +69,23 @@ GONE = ("graph.missing-node", "/talker")
 def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
     finding: tuple[str, ...], plan: Plan
 ) -> None:
-    grace_period = GracePeriod()
-    assert grace_period.after(None, OK, BEFORE, 10.0) == (OK, None)
-    bad = found(finding)
-    assert grace_period.after(OK, bad, plan, 20.0) == (OK, PASSING_S)
-    assert grace_period.after(OK, bad, plan, 20.25) == (OK, PASSING_S - 0.25)
-    assert grace_period.after(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)
+    passing, bad = after(OK), found(finding)
+    for later_s in (0.0, 0.25):
+        assert rules(passing, bad, plan, 20.0 + later_s) == ([], PASSING_S - later_s)
+    assert rules(passing, bad, plan, 20.0 + PASSING_S) == ([finding[0]], NEVER_S)
+
+
+def after(verdict: Verdict, plan: Plan = BEFORE, at_s: float = 0.0) -> Passing:
+    """One that has looked once."""
+    passing = Passing()
+    assert passing.without(verdict, plan, at_s, stage=Stage.ACTIVE) == (verdict, NEVER_S)
+    return passing
+
+
+def rules(passing: Passing, seen: Verdict, plan: Plan, now_s: float) -> tuple[list[str], float]:
+    """The rules of what is left, and when to look again."""
+    left, again_s = passing.without(seen, plan, now_s, stage=Stage.ACTIVE)
+    return [each.rule for each in left.findings], again_s
 
 
 @pytest.mark.parametrize(
@@ -85,35 +97,34 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
         ([("connection.missing", "/talker")], AFTER),
         # It was expected at the first look already.
         ([("graph.missing-endpoint", "/chatter", "/talker")], BEFORE),
-        # With whatever else is wrong all of it is said.
-        ([NEWS, GONE], AFTER),
     ],
 )
 def test_what_was_expected_before_may_not(findings: list[tuple[str, ...]], plan: Plan) -> None:
-    grace_period = GracePeriod()
-    grace_period.after(None, OK, BEFORE, 10.0)
     bad = found(*findings)
-    assert grace_period.after(OK, bad, plan, 20.0) == (bad, None)
+    assert rules(after(OK), bad, plan, 20.0) == ([each[0] for each in findings], NEVER_S)
 
 
-def test_the_first_verdict_and_what_healed_are_said_at_once() -> None:
-    grace_period = GracePeriod()
-    first = found((UNATTRIBUTED, "/rosout", ""), GONE)
-    assert grace_period.after(None, first, BEFORE, 10.0) == (first, None)
-    other = found(NEWS)
-    assert grace_period.after(first, other, AFTER, 20.0) == (other, None)
+def test_what_is_wrong_beside_it_is_said_at_once() -> None:
+    assert rules(after(OK), found(NEWS, GONE), AFTER, 20.0) == ([GONE[0]], PASSING_S)
+
+
+def test_at_a_gate_only_a_peer_that_is_not_known_yet_may_pass_and_only_behind_it() -> None:
+    seen = found((UNATTRIBUTED, "/rosout", ""), ("graph.unknown-peer", "/chatter"))
+    for stage, left in ((Stage.ACTIVE, 1), (Stage.CONNECTED, 2)):
+        verdict, _ = after(OK).without(seen, BEFORE, 1.0, stage=stage, watched=False)
+        assert len(verdict.findings) == left
 
 
 def test_each_newcomer_has_a_moment_of_its_own() -> None:
-    grace_period = GracePeriod()
-    grace_period.after(None, OK, BEFORE, 0.0)
+    passing = after(OK)
     one = found((UNATTRIBUTED, "/rosout", ""))
     two = found((UNATTRIBUTED, "/rosout", ""), (UNATTRIBUTED, "/parameter_events", ""))
-    assert grace_period.after(OK, one, BEFORE, 1.0) == (OK, PASSING_S)
-    assert grace_period.after(OK, two, BEFORE, 1.5) == (OK, PASSING_S - 0.5)
-    assert grace_period.after(OK, OK, BEFORE, 1.75) == (OK, None)
+    assert rules(passing, one, BEFORE, 1.0) == ([], PASSING_S)
+    assert rules(passing, two, BEFORE, 1.5) == ([], PASSING_S - 0.5)
+    assert rules(passing, two, BEFORE, 2.0) == ([UNATTRIBUTED], PASSING_S - 0.5)
+    assert rules(passing, OK, BEFORE, 2.25) == ([], NEVER_S)
     # Gone, and there again: that is another newcomer.
-    assert grace_period.after(OK, one, BEFORE, 2.0) == (OK, PASSING_S)
+    assert rules(passing, one, BEFORE, 2.5) == ([], PASSING_S)
 
 
 STATION = planned(node("station", SERVER))
@@ -137,8 +148,10 @@ def test_a_client_of_an_unknown_node_may_be_half_seen_and_not_of_another_definit
     both = {UNATTRIBUTED, "graph.type-definition-differs"}
     assert {each.rule for each in half.findings} - {each.rule for each in fine.findings} == both
     assert other.verdict is Outcome.VIOLATED
-    for seen, holds in ((half, (fine, PASSING_S)), (other, (other, None))):
-        grace_period = GracePeriod()
-        grace_period.after(None, fine, STATION, 0.0)
-        assert grace_period.after(fine, seen, STATION, 10.0) == holds
-        assert grace_period.after(fine, seen, STATION, 10.0 + PASSING_S) == (seen, None)
+    said = {each.rule for each in other.findings} - {UNATTRIBUTED}
+    for seen, at_first in ((half, set()), (other, said)):
+        passing = after(fine, STATION)
+        left, passes_s = rules(passing, seen, STATION, 10.0)
+        assert ({*left} - {each.rule for each in fine.findings}, passes_s) == (at_first, PASSING_S)
+        said = [each.rule for each in seen.findings]
+        assert rules(passing, seen, STATION, 10.0 + PASSING_S) == (said, NEVER_S)
