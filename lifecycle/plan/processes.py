@@ -18,7 +18,6 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     DiscoveryRange,
-    EndpointKind,
     Node,
     ParameterValue,
     RosArguments,
@@ -34,7 +33,6 @@ from lifecycle.network.ports import (
     describe_domains,
     max_participants,
     safe_domains,
-    unique_flow_ports,
 )
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
 
@@ -270,19 +268,6 @@ def overcrowded(plan: Plan, environment: Mapping[str, str]) -> Iterator[Diagnost
                 hint = f"use a domain of {safe}, fewer processes, or fewer unique publishers"
                 yield make("check.ports", at, message, hint)
                 break
-        ports = unique_flow_ports()
-        subscriptions = sum(
-            each.unique.asks and each.kind is EndpointKind.SUBSCRIPTION
-            for node in nodes
-            for each in node.endpoints
-        )
-        if subscriptions > len(ports) - participants:
-            message = (
-                f"cannot give {subscriptions} subscriptions a port of their own {where}: Fast DDS "
-                f"takes them from {ports[0]}–{ports[-1]}, and one for each of {participants} "
-                "participants"
-            )
-            yield error("check.ports", at, message, "ask for fewer unique subscriptions")
         looking = _participants(
             node
             for node in nodes
