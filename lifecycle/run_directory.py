@@ -104,14 +104,7 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
     else:
         import tempfile
 
-        try:
-            temporary = tempfile.gettempdir()
-        except OSError as error:
-            raise UsageError(
-                "cannot find a directory for run directories: no temporary directory is writable",
-                hint="set XDG_RUNTIME_DIR to a directory of this user's own",
-            ) from error
-        root = Path(temporary) / f"lifecycle-{os.getuid()}"
+        root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
     _refuse_unsafe_parents(root)
     if os.path.lexists(root):
         _refuse_unless_private(root)

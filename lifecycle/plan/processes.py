@@ -29,7 +29,6 @@ from lifecycle.network.ports import (
     LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
-    EphemeralRange,
     describe_domains,
     max_participants,
     safe_domains,
@@ -226,9 +225,6 @@ def _redacted(run: Run) -> Run:
     )
 
 
-_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
-"""Asks for the limits that hold whatever an operating system does with its ports."""
-
 _OTHER_MEANS = (
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -257,7 +253,8 @@ def overcrowded(plan: Plan, environment: Mapping[str, str]) -> Iterator[Diagnost
         at = plan.positions.get("discovery", nodes[0].at)
         where = f"on {' and '.join(dict.fromkeys(repr(node.machine) for node in nodes))}"
         participants = _participants(nodes)
-        for make, ephemeral in ((error, _NO_EPHEMERAL), (note, LINUX)):
+        # What holds whatever an operating system does with its ports, then Linux's default.
+        for make, ephemeral in ((error, range(0)), (note, LINUX)):
             room = max_participants(plan.domain_id, ephemeral)
             if participants > room.participants:
                 message = (

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,29 +23,26 @@ from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
 from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.verify.judge import not_ok
-from lifecycle.verify.verdict import FlowReport
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
-    from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen
+    from lifecycle.programming.target import Program
     from lifecycle.supervisor.run.looking import JudgedSystem
 
 
-def export(
-    plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment | None
-) -> None:
+def export(plan: Plan, flows: Sequence[FlowReport], program: Program) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
         UsageError: it cannot be exported so.
     """
-    programmer = _open(plan, (network,), treatment)
+    programmer = _open(plan, program)
     try:
         text = programmer.export(flows)
     except ValueError as error:
-        raise UsageError(str(error), hint=network.target.hint) from error
+        raise UsageError(str(error), hint=program.targets[0].target.hint) from error
     click.echo(text, nl=False)
     _show_left_out(programmer.left_out)
 
@@ -124,19 +120,21 @@ def _show(
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
     if watch and export_ is not None:
         raise UsageError("cannot use --export with --watch; export once")
-    if export_ is not None:
-        # What is exported for a network takes what programming it takes.
-        (network,), treatment = common.read_networks((export_,), rest, option="--export")
-    elif any(rest.values()):
-        raise UsageError(
-            "cannot say how to treat flows that are only shown",
-            hint="give --export, or use lifecycle flows apply",
-        )
+    # What is exported for a network takes what programming it takes.
+    program = common.read_networks((export_,) if export_ else (), rest, option="--export")
     plan = _plan_of(target, assignments)
     if record is not None:
-        return _record(plan, Record(record))
-    if watch:
-        return _watch(plan, format_)
+        with contextlib.closing(Record(record)) as written:
+            try:
+                over = _follow(plan, lambda verdict: written.add(verdict.measured))
+            finally:
+                common.say(f"{count(written.rows, 'row')} in {str(record)!r}")
+    elif watch:
+        with watched(whole=format_ == "text") as show:
+            over = _follow(plan, lambda verdict: show(watched_flows(verdict, format_)))
+    if record is not None or watch:
+        common.say(over)
+        return ExitCode.OK
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or looking.supervisor_of(
         os.environ, plan, ""
@@ -146,8 +144,8 @@ def _show(
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         common.say(each)
-    if export_ is not None:
-        export(seen.plan, seen.verdict.flows, network, treatment)
+    if program is not None:
+        export(seen.plan, seen.verdict.flows, program)
     else:
         flows, measured = seen.verdict.flows, seen.verdict.measured
         click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
@@ -164,61 +162,27 @@ def _measuring(plan: Plan) -> Path | None:
     return next((each for each in found if each is not None), None)
 
 
-def _watch(plan: Plan, format_: str) -> int:
-    from lifecycle.supervisor.control.protocol import follow
-    from lifecycle.supervisor.run.looking import follow_running
-
-    path = _measuring(plan)
-    with watched(whole=format_ == "text") as show:
-        if path is None:
-            follow_running(
-                plan, lambda seen: show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
-            )
-            return ExitCode.OK
-        with common.asking(path):
-            for seen in follow(path):
-                if seen.verdict is not None:
-                    show(watched_flows(seen.verdict, format_))
-    common.say(f"{path.name}: its supervisor has ended")
-    return ExitCode.OK
-
-
 _EACH_S = 1.0
 """What is measured changes so often."""
 
 
-def _record(plan: Plan, record: Record) -> int:
-    """Write what is measured each second, until it is interrupted or the supervisor ends."""
+def _follow(plan: Plan, take: Callable[[Verdict], None]) -> str:
+    """Give each verdict as it changes, with what is measured; return why there are no more.
+
+    Where no supervisor of this host measures, it is looked from outside until interrupted.
+    """
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
-    with contextlib.closing(record):
-        try:
-            if path is not None:
-                _record_supervised(path, record)
-            else:
-                follow_running(plan, lambda seen: record.add(seen.verdict.measured), each_s=_EACH_S)
-        finally:
-            common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
-    return ExitCode.OK
-
-
-def _record_supervised(path: Path, record: Record) -> None:
-    from lifecycle.supervisor.control.protocol import status
-
-    began_s = time.monotonic()
-    for number in itertools.count():
-        time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
-        try:
-            measured = status(path).measured
-        except TimeoutError:
-            continue  # it is busy; the next one may be answered
-        except UsageError:
-            if number == 0:
-                raise
-            common.say(f"{path.name}: its supervisor has ended")
-            return
-        record.add(measured)
+    if path is None:
+        follow_running(plan, lambda seen: take(seen.verdict), each_s=_EACH_S)
+        return "nothing more to see"
+    with common.asking(path):
+        for seen in follow(path):
+            if seen.verdict is not None:
+                take(seen.verdict)
+    return f"{path.name}: its supervisor has ended"
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
@@ -232,14 +196,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
         return look(path).plan
 
 
-def apply(
-    plan: Plan,
-    flows: Sequence[FlowReport],
-    options: Sequence[Chosen],
-    *,
-    dry_run: bool,
-    treatment: Treatment | None = None,
-) -> bool:
+def apply(plan: Plan, flows: Sequence[FlowReport], program: Program, *, dry_run: bool) -> bool:
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
@@ -249,7 +206,7 @@ def apply(
     """
     from lifecycle.programming.target import PartlyError
 
-    programmer = _open(plan, options, treatment)
+    programmer = _open(plan, program)
     try:
         changes = asyncio.run(programmer.diff(flows) if dry_run else programmer.update(flows))
     except PartlyError as error:
@@ -300,8 +257,8 @@ def _apply(
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    options, treatment = common.read_networks(targets, rest, option="--target")
-    if not options:
+    program = common.read_networks(targets, rest, option="--target")
+    if program is None:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
@@ -311,7 +268,7 @@ def _apply(
     for each in seen.notices:
         common.say(each)
     flows = seen.verdict.flows
-    changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    changed = apply(seen.plan, flows, program, dry_run=dry_run)
     if changed and dry_run:
         return ExitCode.VIOLATED
     if changed and plan.bounds:
@@ -361,10 +318,10 @@ def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     return remove(common.load_plan(manifest, assignments))
 
 
-def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
+def _open(plan: Plan, program: Program) -> Programmer:
     from lifecycle.programming.programmer import open_programmer
 
-    return open_programmer(plan, options, environment=os.environ, treatment=treatment)
+    return open_programmer(plan, program, environment=os.environ)
 
 
 def _show_left_out(flows: Iterable[str]) -> None:

@@ -18,7 +18,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
-from lifecycle.network.dscp import MappedPriority, describe
+from lifecycle.network.dscp import ECN_MASK, describe
 from lifecycle.network.nfe import UniqueRequirement
 
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -53,15 +53,15 @@ def check_flows(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
             )
             hint = "make it RELIABLE, or mark the publishers of the topic"
             yield note("check.flow-dscp", need.at, message, hint)
-        if each.priority is not None:
-            yield from _priority(need, each.priority)
+        if need.transport_priority is not None:
+            yield from _priority(need, each.tos)
         message, hint = each.flow_class.problem
         if message:
             yield error("check.flow-five-qi", need.at, message, hint)
-        for issue in () if message else each.flow_class.issues:
-            make = error if issue.field in _KEPT_BY_CLASS else note
+        for field, issue in each.flow_class.issues:
+            make = error if field in _KEPT_BY_CLASS else note
             hint = "choose another class, or write 'five_qi: auto'"
-            yield make("check.five-qi-class", need.at, issue.message, hint)
+            yield make("check.five-qi-class", need.at, issue, hint)
 
 
 def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
@@ -77,26 +77,20 @@ def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
     return error("check.flow-unknown-endpoint", need.at, message, hint)
 
 
-def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
-    """Say what a 'transport_priority' cannot be, and which of its bits get lost."""
+def _priority(need: FlowNeed, tos: int | None) -> Iterator[Diagnostic]:
+    """Say what a 'transport_priority' cannot be."""
     number = need.transport_priority or 0
     priority = f"transport_priority {number} ({number:#x})"
-    left = "" if mapped.tos is None else f"without them it is {describe(mapped.tos >> 2)}"
     if need.dscp is not None:
         message = f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority"
         hint = f"keep one; the one is {describe(need.dscp)}, the other {priority}"
         yield error("check.flow-dscp", need.at, message, hint)
-    elif mapped.sets_ecn:
+    elif tos is not None and tos & ECN_MASK:
         message = (
-            f"cannot use {priority}: the two lowest bits of TOS {mapped.tos} are ECN and belong to "
-            "the transport (RFC 3168)"
+            f"cannot use {priority}: the two lowest bits of TOS {tos} are ECN and belong to the "
+            "transport (RFC 3168)"
         )
-        yield error("check.flow-dscp", need.at, message, left)
-    elif mapped.ignored_bits or mapped.tos is None:
-        message = (
-            f"cannot map bits {mapped.ignored_bits:#x} of {priority}: the mask leaves them out"
-        )
-        yield note("check.transport-priority", need.at, message, left)
+        yield error("check.flow-dscp", need.at, message, f"without them it is {describe(tos >> 2)}")
 
 
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}

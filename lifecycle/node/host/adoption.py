@@ -49,8 +49,6 @@ _FACTORIES = {
 }
 """What each makes, and its positional parameters where it can be made with a flow of its own."""
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
-_UNSAID = ("undeclare_parameter", "set_descriptor")
-"""They change the parameters of a node, and rclpy publishes no event of it."""
 
 
 def initialised(
@@ -146,8 +144,6 @@ class Adoption:
             self._wrap(name, functools.partial(self._create, kind, names))
         for name in _REMOVERS:
             self._wrap(name, self._remove)
-        for name in _UNSAID:
-            self._wrap(name, self._change_parameters)
 
     def unfollow(self) -> None:
         """Take no node that is made from now on for one of the plan."""
@@ -198,14 +194,11 @@ class Adoption:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.close()
         destroy(node)
-
-    def _change_parameters(
-        self, change: Callable[..., Any], node: Node, *arguments: Any, **options: Any
-    ) -> Any:
-        result = change(node, *arguments, **options)
-        if (foreign := self._foreign.get(id(node))) is not None:
-            foreign.configuration_changes.touch()
-        return result
+        for hosted in self.made.values():
+            if hosted.node is node and not hosted.is_destroyed:
+                hosted.is_destroyed = True
+                for listener in hosted.listeners:
+                    listener(hosted)
 
     def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
         self._loop.take_waitable(node, waitable)  # before its executor can look

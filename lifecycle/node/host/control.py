@@ -118,7 +118,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
             `error` says why, the process exits),
             "state" (a node's state changed), "reply", "beat" (the executor has returned from a
             callback that took too long), "configuration" (it changed: endpoints, connections,
-            mappings or matches), "measured" (every half second, of an active node).
+            mappings or matches), "measured" (every half second, of an active node), "destroyed" (by
+            its own code, in a process that goes on).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
         state: lifecycle_msgs/State label after it; empty of a plain node.

@@ -21,14 +21,12 @@ from lifecycle.middleware.fastdds.discovery import (
 )
 from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.control.status import finding_of
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Failure, ProcessChanged, StepFailedError
 from lifecycle.supervisor.run.options import own_machines
 from lifecycle.verify.rules import Rule
 from lifecycle.verify.rules.catalogue import DEADLINE, PROCESS_DIED, START_FAILED
-from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.fork_server import ForkServer
@@ -115,20 +113,12 @@ def _say(system: System, state: ProcessState) -> None:
     system.emit(ProcessChanged(process=NAME, state=state, pid=server.pid, detail=detail))
 
 
-def findings(system: System) -> tuple[Finding, ...]:
-    """Return that it died; until the system is started again no new node is found.
+def death(server: ManagedProcess, end: ProcessExit) -> Failure:
+    """Return the failure that its end is; the run ends of it.
 
     Another one in its place does not mend that: Fast DDS 2.14 does not notify super clients, as our
     observer is one, of participants that join after it (0 of 4 tries; other clients 10 of 12).
     """
-    server = system.server
-    if server is None or not server.ended.done():
-        return ()
-    return (finding_of(death(server, server.ended.result())),)
-
-
-def death(server: ManagedProcess, end: ProcessExit) -> Failure:
-    """Return the failure that its end is."""
     words = f": {server.last_words}" if server.last_words else ""
     return Failure(
         rule=PROCESS_DIED.id,

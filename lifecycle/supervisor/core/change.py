@@ -210,7 +210,6 @@ def _take(run: Run, change: Change) -> None:
         if process is not None and process.state is None:
             process.restarted_by_hand()
     change.taken, change.down = True, set()
-    run.came = bool(change.touched)
     run.changed()
     until = Until.VERIFIED if run.paused else Until.ACTIVE
     run.passage = Passage(until_s=change.until_s, until=until)

@@ -296,7 +296,7 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
     if run.passage is not None:
-        run.passage.at_gate, run.passage.until_s = False, due_s + run.timeout_s
+        run.passage.mark, run.passage.until_s = None, due_s + run.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,

@@ -188,15 +188,9 @@ class Refused(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Broken(msgspec.Struct, frozen=True, kw_only=True):
-    """Something failed that is no node's: the discovery server died, the fork server died.
-
-    Attributes:
-        finds: it is by what nodes find each other, and not by what they are started: those that run
-            may go on.
-    """
+    """Something failed that is no node's: the discovery server died, the fork server died."""
 
     failure: Failure
-    finds: bool = False
 
 
 Input = (

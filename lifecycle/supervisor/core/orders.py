@@ -62,15 +62,6 @@ def _cannot(order: Order, what: str) -> str:
 
 def _unfit(run: Run, order: Order) -> str:
     """Say why an order can be carried out in no phase; empty if it can."""
-    if order.first is not None and order.first is not run.first:
-        what = _cannot(order, run.plan.system)
-        return f"{what}: another manifest was applied meanwhile; ask again"
-    if order.ask in STARTS and run.broken:
-        what = _cannot(order, order.node or run.plan.system)
-        return (
-            f"{what}: the discovery server has died, and without it nobody who comes again is "
-            "found; start the system again: lifecycle down, then lifecycle up"
-        )
     if order.node and named(run, order.node) is None:
         return _not_restarted(run, order.node)
     return _not_entered(run, order.mode) if order.ask is ControlRequest.MODE else ""
@@ -236,7 +227,6 @@ def settle_consequences(run: Run) -> list[Event]:
     """Do about violations that last what the manifest asks for, as a person would order it."""
     verdict = run.judged.verdict
     if run.held_s is None or run.paused or verdict is None:
-        run.judged.asked = {}
         return []
     busy = run.order or run.opening or not _is_free(run)
     if busy or run.options.until is not Until.ACTIVE:
@@ -249,10 +239,11 @@ def settle_consequences(run: Run) -> list[Event]:
         due = _asked(run, each)
         if each.outcome is Outcome.VIOLATED and due and coming.isdisjoint(each.nodes):
             asked[each.key] = due
-    run.judged.asked = {key: run.judged.asked.get(key, run.now_s) for key in asked}
-    since_s = run.judged.asked
+    since_s = run.judged.violated
     lasting = [
-        due for key, due in asked.items() if gate.lasts_until(run, since_s[key] + gate.SETTLED_S)
+        due
+        for key, due in asked.items()
+        if key in since_s and gate.lasts_until(run, since_s[key] + gate.SETTLED_S)
     ]
     if not lasting:
         return []
@@ -261,7 +252,6 @@ def settle_consequences(run: Run) -> list[Event]:
     if worst[0] is Consequence.MODE:
         run.judged.tried |= {key for key, due in asked.items() if due[3] == worst[3]}
     run.judged.counted = run.judged.counted or not_ok(verdict)
-    run.judged.asked = {}
     return _order(run, worst[0], worst[1], tuple(key for key in run.nodes if key in keys), worst[3])
 
 

@@ -6,9 +6,6 @@ nodes are started again before it because TCP did not let others discover them. 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Mapping
-
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import advance, failure, gate
@@ -31,7 +28,7 @@ def settle(run: Run) -> list[Event]:
     """Take the passage as far as the state allows."""
     if run.failures:
         return []
-    events = [*_come(run), *_arrive(run)]
+    events = _arrive(run)
     if run.opening is not None:
         return [*events, *_go_on(run, run.opening)]
     _wait_again(run)
@@ -54,13 +51,13 @@ def _arrive(run: Run) -> list[Event]:
     _is_at_gate(run, passage)
     if passage.until is Until.CONNECTED:
         run.passage = None
-    return []
+    return [reached(run, "connected")]
 
 
 def _is_at_gate(run: Run, passage: Passage) -> None:
     """Have the gate judged anew, by a look that begins now."""
     run.changed()
-    passage.at_gate, passage.since_s, passage.mark = True, run.now_s, run.mark
+    passage.since_s, passage.mark = run.now_s, run.mark
     run.judged.found, run.judged.since_s = frozenset(), run.now_s
 
 
@@ -69,30 +66,16 @@ def _wait_again(run: Run) -> None:
     if run.asked is not None:
         return
     busy = run.switch is not None or run.change is not None or run.held_s is None
-    keys = () if busy else advance.waiting(run)
-    if busy or not (keys or run.again) or not advance.is_at_gate(run):
+    if busy or not advance.waiting(run) or not advance.is_at_gate(run):
         run.passage = None
     elif run.passage is None:
-        run.passage = Passage(until_s=run.now_s + run.timeout_s, asked=False, at_gate=True)
-        if keys and not gate.is_open(run):
+        run.passage = Passage(until_s=run.now_s + run.timeout_s, asked=False, mark=0)
+        if not gate.is_open(run):
             _is_at_gate(run, run.passage)
 
 
-def _come(run: Run) -> list[Event]:
-    """Say that all who came up are at the gate."""
-    if not run.came or run.is_changing or run.is_backing_off or not advance.is_at_gate(run):
-        return []
-    asked = run.asked
-    waited = asked is not None and run.is_past(asked.since_s + gate.SAY_S)
-    nodes = [each for each in run.nodes.values() if each.process and advance.only_appears(each)]
-    if not waited and any(not each.level and advance.wanted(run, each) for each in nodes):
-        return []
-    run.came, run.again = False, run.held_s is not None
-    return [reached(run, "connected")]
-
-
 def _open(run: Run, passage: Passage) -> list[Event]:
-    if not passage.at_gate or run.judged.mark < passage.mark:
+    if passage.mark is None or run.judged.mark < passage.mark:
         return []
     if gate.is_open(run):
         if passage.until is Until.ACTIVE:
@@ -101,34 +84,27 @@ def _open(run: Run, passage: Passage) -> list[Event]:
             run.passage = None
         return [reached(run, "verified")]
     refuses = run.is_past(gate.refuses_at_s(run, passage.until_s))
-    if not passage.asked:
-        return _say_closed(run, passage) if refuses else []
+    if not passage.asked:  # who policy started again goes on waiting
+        return _say_closed(run, passage) if refuses and advance.waiting(run) else []
     if refuses:
         return _refused(run, again=False)
     # The verdict may allow it, and never be of a moment that lasts.
     if run.is_past(passage.until_s + gate.LEAST_S):
         return failure.fail_late(run, "it changes all the time")
-    return _say_waiting(run, passage)
+    late = not gate.allows(run) and run.is_past(passage.since_s + gate.SAY_S)
+    return _say_closed(run, passage) if late else []
 
 
 def _say_closed(run: Run, passage: Passage) -> list[Event]:
-    """Say once that nodes wait at a gate that stays closed; they go on waiting."""
+    """Say once that the gate stays closed: of what is asked, for how long it may."""
     verdict = run.judged.verdict
-    if passage.said or verdict is None or not advance.waiting(run):
+    if passage.said or verdict is None:
         return []
     passage.said = True
-    return [Notice(message=gate.refusal(verdict))]
-
-
-def _say_waiting(run: Run, passage: Passage) -> list[Event]:
-    verdict = run.judged.verdict
-    due_s = passage.since_s + gate.SAY_S
-    if passage.said or verdict is None or gate.allows(run) or not run.is_past(due_s):
-        return []
-    passage.said = True
+    if not passage.asked:
+        return [Notice(message=gate.refusal(verdict))]
     left_s = max(0.0, passage.until_s - run.now_s)
-    text = f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}"
-    return [Notice(message=text)]
+    return [Notice(message=f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}")]
 
 
 def _begin(run: Run, passage: Passage) -> None:
@@ -186,7 +162,7 @@ def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
 
 
 def _passed(run: Run) -> list[Event]:
-    run.passage, run.again = None, False
+    run.passage = None
     for node in run.nodes.values():
         if node.level is Level.ACTIVE:
             node.guarded = 0
@@ -208,7 +184,7 @@ def _withdraw(run: Run, passage: Passage) -> list[Event]:
     for node in begun:
         node.let_through = False
     run.paused = run.paused or passage.paused
-    run.passage, run.again = None, False
+    run.passage = None
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 
@@ -283,68 +259,57 @@ UNCHANGED_S = 5.0
 after 1–4 s; findings that have not changed for so long do not change any more."""
 
 TRIES = 3
-"""So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
+"""So often nodes are started again before a gate: each time takes 1–5 s of the bring-up."""
 
 
 def settle_first_contact(run: Run) -> list[Event]:
-    """Have a node started again on a fresh port that others do not discover although it runs."""
+    """Have nodes started again on fresh ports that others do not discover although they run."""
     passage, judged = run.asked, run.judged
     if passage is None or not passage.at_gate or run.opening is not None or run.failures:
         return []
-    is_late = passage.until_s - run.now_s <= UNCHANGED_S or passage.tries.total() >= TRIES
+    is_late = passage.until_s - run.now_s <= UNCHANGED_S or passage.tries >= TRIES
     lasts = gate.lasts_until(run, judged.since_s + UNCHANGED_S)
     if judged.verdict is None or is_late or not lasts:
         return []
-    name = undiscovered(judged.verdict, _restartable(run), passage.tries)
-    node = None if name is None else run.node_named(name)
-    if node is None:
+    lacking, moving = undiscovered(judged.verdict), moving_nodes(run.plan)
+    found = {
+        node.process: node.name
+        for key, node in run.nodes.items()
+        if key in moving and node.name in lacking and _may_be_restarted(run, node.process)
+    }
+    if not found:
         return []
-    passage.tries[node.name] += 1
+    passage.tries += 1
     judged.since_s = run.now_s
-    for each in run.nodes_of(node.process):
-        each.renew = True
+    for process in found:
+        for each in run.nodes_of(process):
+            each.renew = True
+    names = " and ".join(map(repr, found.values()))
     text = (
-        f"{name!r} is started again on a fresh port: not discovered over TCP "
-        f"for {UNCHANGED_S:g} s ({not_ok(judged.verdict)}); "
-        f"try {passage.tries.total()} of {TRIES}"
+        f"{names} {'is' if len(found) == 1 else 'are'} started again on a fresh port: not "
+        f"discovered over TCP for {UNCHANGED_S:g} s ({not_ok(judged.verdict)}); "
+        f"try {passage.tries} of {TRIES}"
     )
     return [Notice(message=text)]
 
 
-def _restartable(run: Run) -> frozenset[str]:
-    moving = moving_nodes(run.plan)
-    active = {each.process for each in run.nodes.values() if each.level is Level.ACTIVE}
-    return frozenset(
-        each.name
-        for key, each in run.nodes.items()
-        if key in moving
-        and each.process not in active
-        and each.process in run.processes
-        and run.processes[each.process].state is ProcessState.RUNNING
-    )
+def _may_be_restarted(run: Run, name: str) -> bool:
+    process = run.processes.get(name)
+    active = any(each.level is Level.ACTIVE for each in run.nodes_of(name))
+    return process is not None and process.state is ProcessState.RUNNING and not active
 
 
-def undiscovered(
-    verdict: Verdict, restartable: Collection[str], tries: Mapping[str, int]
-) -> str | None:
-    """Return the full name of the node to start again; None where that would mend nothing.
+def undiscovered(verdict: Verdict) -> frozenset[str]:
+    """Return the names of the nodes that may be undiscovered; of none if that would mend nothing.
 
-    Of two ends that do not match either may be the undiscovered one: it is who lacks most, then who
-    was started again least often, then the last by name.
+    Of two ends that do not match either may be.
     """
     violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
     if not all(rule(each.rule).if_undiscovered for each in violated):
-        return None
-    missing = [each for each in violated if each.rule == MISSING_NODE.id]
+        return frozenset()
+    missing = {each.node for each in violated if each.rule == MISSING_NODE.id}
     # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.
-    coming = (each for each in violated if rule(each.rule).about is About.PROGRESS)
-    awaited = {each.node for each in (*missing, *coming)}
-    unmatched = (each for each in violated if rule(each.rule).about is About.MATCH)
-    pairs = (each.ends for each in unmatched if awaited.isdisjoint(each.ends))
-    lacks = Counter(
-        name
-        for names in (*pairs, *((each.node,) for each in missing))
-        for name in names
-        if name in restartable
-    )
-    return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)
+    coming = {each.node for each in violated if rule(each.rule).about is About.PROGRESS}
+    unmatched = (each.ends for each in violated if rule(each.rule).about is About.MATCH)
+    pairs = (each for each in unmatched if (missing | coming).isdisjoint(each))
+    return frozenset(missing.union(*pairs))

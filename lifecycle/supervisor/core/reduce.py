@@ -203,8 +203,6 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     node.level = given.level
     if error:
         return _step_failed(run, node, step, error, goal)
-    if step in UP.values() and step is not Step.ACTIVATE:
-        run.came = True
     if given.already and node.base is was and not node.process and not node.planned.run.component:
         node.base = node.level  # it was found so
     process = run.processes.get(node.process)
@@ -309,12 +307,8 @@ def _stop(run: Run, given: messages.Stop) -> list[Event]:
 
 
 def _broken(run: Run, given: messages.Broken) -> list[Event]:
-    run.broken = run.broken or given.finds
-    if run.ending is not None:
-        return []
-    if given.finds:
-        return failure.fail(run, given.failure)
-    run.fails_now(given.failure)
+    if run.ending is None:
+        run.fails_now(given.failure)
     return []
 
 

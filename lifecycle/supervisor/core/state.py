@@ -11,7 +11,7 @@ a run is here: nothing is kept in a coroutine, a timer or a callback. Pure.
 from __future__ import annotations
 
 import enum
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -315,12 +315,10 @@ class Order(Question, kw_only=True, frozen=True):
     Attributes:
         plan: of the manifest that an order names, as it is now; None if it names none.
         id: by which it is answered, once.
-        first: the manifest that it was checked against; None if that is of no account.
     """
 
     plan: Plan | None = None
     id: int = 0
-    first: Plan | None = None
 
 
 class Passage(msgspec.Struct, kw_only=True):
@@ -335,9 +333,8 @@ class Passage(msgspec.Struct, kw_only=True):
         until: CONNECTED: they are only to come to the gate, VERIFIED: it is only judged, ACTIVE: it
             lets them through.
         mode: to go back to where the gate stays closed; empty for a passage of another kind.
-        at_gate: the nodes have come as far.
-        tries: nodes that were started again at it, by full name, and how often.
-        mark: of the moment at which they had; `since_s`: when that was.
+        mark: of the moment at which the nodes had come to the gate, at `since_s`; None before.
+        tries: how often nodes were started again at it.
         said: it was said what the gate waits for.
         begun_s: when a verdict opened the gate; None before.
         waiting: keys of the nodes that it is for; `sent`: of those that were sent their requests.
@@ -351,9 +348,8 @@ class Passage(msgspec.Struct, kw_only=True):
     asked: bool = True
     until: Until = Until.ACTIVE
     mode: str = ""
-    at_gate: bool = False
-    tries: Counter[str] = msgspec.field(default_factory=Counter)
-    mark: int = 0
+    mark: int | None = None
+    tries: int = 0
     since_s: float = NEVER_S
     said: bool = False
     begun_s: float | None = None
@@ -363,6 +359,11 @@ class Passage(msgspec.Struct, kw_only=True):
     programming: int = 0
     opened: bool = False
     paused: bool = False
+
+    @property
+    def at_gate(self) -> bool:
+        """Whether its nodes have come as far."""
+        return self.mark is not None
 
     @property
     def is_programmed(self) -> bool:
@@ -425,7 +426,6 @@ class Judged(msgspec.Struct, kw_only=True):
         violated: since when each violation lasts.
         counted: the first that lasted, as text; it is in the exit code.
         passed: what was violated, and whether it lasted.
-        asked: violations that a consequence is asked for, and since when.
         tried: those for which a mode was entered.
     """
 
@@ -441,7 +441,6 @@ class Judged(msgspec.Struct, kw_only=True):
     violated: dict[FindingKey, float] = {}
     counted: str = ""
     passed: dict[str, bool] = {}
-    asked: dict[FindingKey, float] = {}
     tried: set[FindingKey] = msgspec.field(default_factory=set)
 
 
@@ -474,10 +473,8 @@ class Run(msgspec.Struct, kw_only=True):
         elsewhere: conditions that nodes of other supervisors have reached, by key.
         left: full names of nodes whose supervisor was shut down, and said so.
         early: keys of the nodes that are configured before any node is wired.
-        broken: what processes are started by, or found by, has died.
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
-        came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
         to_give: parameters of running nodes that are set first, None for all of its mode; `giving`:
             keys of the nodes that have to answer.
         undone: how the order under way is answered once what it did is undone.
@@ -504,7 +501,6 @@ class Run(msgspec.Struct, kw_only=True):
     elsewhere: dict[str, frozenset[Condition | Readiness]] = {}
     left: frozenset[str] = frozenset()
     early: frozenset[str] = frozenset()
-    broken: bool = False
     revision: int = 1
     revisions: int = 1
     mode: str = ""
@@ -512,8 +508,6 @@ class Run(msgspec.Struct, kw_only=True):
     mark: int = 0
     requests: int = 0
     judged: Judged = msgspec.field(default_factory=Judged)
-    came: bool = True
-    again: bool = False
     to_give: dict[str, GivenParameters | None] = {}
     giving: set[str] = msgspec.field(default_factory=set)
     undone: tuple[ExitCode, str] | None = None

@@ -18,7 +18,6 @@ from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition, EndpointKind
 from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core.state import HOLDS, NEVER_S, Level
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
@@ -233,8 +232,7 @@ class Looks:
             verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
         )
         verdict = self._shell.peers.explained(verdict)
-        more = (*self._shell.peers.findings(observation), *discovery_server.findings(system))
-        return with_findings(verdict, more, expected.policy)
+        return with_findings(verdict, self._shell.peers.findings(observation), expected.policy)
 
     def _with_activity(self, observation: Observation) -> Observation:
         """Return what was seen, with how long nodes are seen to be active that are not our hosts'.

@@ -175,7 +175,6 @@ class Supervisor:
         if order.ask is ControlRequest.APPLY and order.plan is not None:
             what = change_to(run, order.plan)
             change = changed_nodes(what, run.first, order.plan, run.revision)
-        order = replace(order, first=run.first)
         code, why = refused_at_once(run, order)
         if change is not None and order.dry_run:
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
@@ -413,7 +412,7 @@ class Supervisor:
     async def _watch_discovery_server(self) -> None:
         if (server := self.system.server) is not None:
             found = discovery_server.death(server, await asyncio.shield(server.ended))
-            self.give(messages.Broken(failure=found, finds=True))
+            self.give(messages.Broken(failure=found))
 
     # From begin to end
 

@@ -11,7 +11,7 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from tests.ros.middleware.free_ports import first_port
-from tests.ros.supervisor.running import Up, pair, up, verb
+from tests.ros.supervisor.running import pair, up, verb
 
 pytestmark = pytest.mark.thorough
 
@@ -22,20 +22,6 @@ def by_tcp(directory: Path, domain_id: int, **discovery: str) -> Path:
     return pair(directory, domain_id, edit={"discovery": how})
 
 
-def violations(run: Up) -> set[tuple[str, str, str]]:
-    """Rule, subject and message of every finding of every verdict so far."""
-    return {
-        (each["rule"], each["subject"], each["message"])
-        for event in run.of_kind("verdict")
-        for each in event["verdict"]["findings"]
-    }
-
-
-@pytest.mark.parametrize(
-    ("mode", "orders"),
-    [("static", (("talker",), ("listener",))), ("server", (("listener",), ()))],
-    ids=["static", "server"],
-)
 def test_who_is_restarted_or_killed_is_found_again(
     tmp_path: Path, fresh_domain: int, mode: str, orders: tuple[tuple[str, ...], ...]
 ) -> None:
@@ -64,7 +50,7 @@ def test_who_is_restarted_or_killed_is_found_again(
         run.assert_nothing_left()
 
 
-def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_runs(
+def test_a_discovery_server_that_dies_ends_the_run_and_is_named(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     manifest = by_tcp(tmp_path, fresh_domain, mode="server")
@@ -72,18 +58,9 @@ def test_a_discovery_server_that_dies_is_a_violation_for_as_long_as_the_system_r
         run.until("system", reached="active")
         pid = run.pid_of("discovery_server")
         os.kill(pid, signal.SIGKILL)
-        died = f"cannot keep process 'discovery_server' running: pid {pid} died: killed by SIGKILL"
-        told = ("run.process-died", "discovery_server", died)
-        while told not in violations(run):
-            run.until("verdict")
-        for words, what in ((("pair",), "pair"), (("pair", "talker"), "talker")):
-            refused = verb("restart", *words, runtime=tmp_path)
-            assert refused.returncode == ExitCode.USAGE
-            assert refused.stderr == (
-                f"cannot restart {what!r}: the discovery server has died, and without it nobody "
-                "who comes again is found; start the system again: lifecycle down, then "
-                "lifecycle up\n"
-            )
-        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.BRING_UP_FAILED
+        died = f"cannot keep process 'discovery_server' running: pid {pid} died: killed by SIGKILL"
+        (failed,) = run.of_kind("failure")
+        said = (failed["rule"], failed["subject"], failed["message"])
+        assert said == ("run.process-died", "discovery_server", died)
         run.assert_nothing_left()

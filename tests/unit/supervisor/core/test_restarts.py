@@ -167,25 +167,6 @@ def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_d
     assert play.code == 7
 
 
-def test_a_system_is_connected_again_once_all_are_back_that_failed() -> None:
-    late = replace(AGAIN, restart_sec=5.0)
-    play = Play(plan_of(planned_node("a", supervision=AGAIN), planned_node("b", supervision=late)))
-
-    def connected() -> int:
-        return [each.reached for each in play.heard(SystemReached)].count("connected")
-
-    play.die("b")
-    play.die("a")
-    play.wait(3.0)
-    assert (play.levels, connected(), _restarted(play)) == ("4 0", 1, ["a"])
-    play.ways["b configure"] = "no arm"
-    play.wait(3.0)
-    assert (connected(), _restarted(play)) == (1, ["a"])
-    play.ways.clear()
-    play.wait(6.0)
-    assert (connected(), _restarted(play)) == (2, ["a", "b"])
-
-
 def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate() -> None:
     play = Play(chain())
     play.ways["camera configure"] = "hang"
