@@ -330,7 +330,7 @@ def build_node(
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
         remap=tuple(node.remap.items()),
-        after=tuple(_after(part, shared, found)),
+        after=tuple(_after(part, shared)),
         supervision=build(Supervision, node),
         on_violation=node.on_violation.value if node.on_violation else (),
         interface=interface,
@@ -346,23 +346,16 @@ def build_node(
     return shared.given_to(built)
 
 
-def _after(node: Document, shared: Shared, found: Findings) -> Iterator[After]:
+def _after(node: Document, shared: Shared) -> Iterator[After]:
     for name, each in node.entries("after"):
         key = shared.key(name)
         if not isinstance(each.root.data, dict):
             yield After(node=key, condition=Condition(each.scalar), at=each.key_at())
             continue
         for word, shown in each.entries():
-            by, names = ReadyBy(word), list[tuple[str, ParameterValue | None, Position]]()
-            if isinstance(shown.root.data, dict):
-                values = flat_parameters(shown.entries(), found)
-                names += [(name, value, at) for name, (value, at) in values.items()]
-            else:
-                so = True if by is ReadyBy.PARAMETER else None
-                items = shown.items() if isinstance(shown.root.data, tuple) else (shown,)
-                names += [(each.root.text, so, each.at()) for each in items]
-            for named, value, at in names:
-                yield After(node=key, condition=Readiness(by=by, name=named, value=value), at=at)
+            for one in shown.items() if isinstance(shown.root.data, tuple) else (shown,):
+                condition = Readiness(by=ReadyBy(word), name=one.root.text)
+                yield After(node=key, condition=condition, at=one.at())
 
 
 def absolute(base: Path, path: str) -> str:

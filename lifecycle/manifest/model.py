@@ -7,7 +7,6 @@ Nothing here knows YAML. Pure.
 from __future__ import annotations
 
 import enum
-import json
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -458,20 +457,18 @@ class Readiness(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     for before the gate opens, so it must not depend on that.
 
     Attributes:
-        by: that it has a publisher, a server of a service or an action, or a parameter.
+        by: that it has a publisher, a server of a service or an action, or a true parameter.
         name: as the node's own code uses it, before its namespace and its remap rules.
-        value: of the parameter.
     """
 
     by: ReadyBy
     name: str
-    value: ParameterValue | None = None
 
     def __str__(self) -> str:
         """Return it as people read it after the node's name: `publishes scan`."""
         if self.by is not ReadyBy.PARAMETER:
             return f"{self.by.value} {self.name}"
-        return f"has parameter {self.name}: {json.dumps(self.value, ensure_ascii=False)}"
+        return f"has parameter {self.name}: true"
 
 
 class After(msgspec.Struct, frozen=True, kw_only=True):

@@ -357,15 +357,14 @@ class Ready(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         publishes: Topics that it has publishers of, by the names that its own code uses: relative,
             absolute or ~/private, before its namespace and remapping.
         serves: Services and actions that it has servers of, likewise.
-        parameter: Parameter that it has and that is true; or parameters and the values that they
-            have. Nested mappings are joined with dots.
+        parameter: Parameters that it has and that are true.
     """
 
     ANY_OF: ClassVar[Ways] = (("publishes",), ("serves",), ("parameter",))
 
     publishes: Annotated[Names, Meta(examples=["scan"])] | None = None
     serves: Annotated[Names, Meta(examples=["~/reset"])] | None = None
-    parameter: Text | Annotated[dict[Text, ParameterTree], Meta(min_length=1)] | None = None
+    parameter: Annotated[Names, Meta(examples=["ready"])] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError unless one of its sets of keys is written."""
