@@ -75,8 +75,16 @@ def run(
             (hosted,) = adoption.make(spec, [spec], node_class)
         name = hosted.full_name
         loop.add(hosted)
-        hosted.listeners.append(lambda _: say(f"{name}: {_state(hosted)}"))
-        say(f"{name}: {_state(hosted)}")
+        said = ""
+
+        def say_state(_: object) -> None:
+            nonlocal said
+            if said != (state := _state(hosted)):
+                said = state
+                say(f"{name}: {state}")
+
+        hosted.listeners.append(say_state)
+        say_state(hosted)
         if lifecycle is None:
             auto = isinstance(hosted, Managed) and hosted.auto
         if auto and hosted.spec.managed:

@@ -75,6 +75,6 @@ def test_a_name_is_given_to_what_needs_one(what: Callable[..., Any], needs: bool
 
 def test_a_name_that_the_manifest_gives_stays() -> None:
     planned = hosted("camera", "Good")
-    run = replace(planned.run, arguments=(("node_name", "mine"), ("sizes", (1, 2))))
+    run = replace(planned.run, arguments={"node_name": "mine", "sizes": (1, 2)})
     planned = replace(planned, run=run)
     assert keywords(planned, _function) == {"node_name": "mine", "sizes": [1, 2]}
