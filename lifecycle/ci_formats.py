@@ -27,6 +27,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         at: `file:line:column` that it is about; empty for none.
         failure: (message, text); None if it passes.
         note: text beside its result; empty for none.
+        skipped: why it was not judged; empty if it was.
     """
 
     classname: str
@@ -34,15 +35,20 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     at: str = ""
     failure: tuple[str, str] | None = None
     note: str = ""
+    skipped: str = ""
 
 
 def junit(name: str, cases: Sequence[Case], *, note: str = "") -> str:
     """Return JUnit XML of one suite, with text that is of all of its cases."""
     root = ET.Element("testsuites")
     suite = ET.SubElement(root, "testsuite", name=lines(name))
-    failures = sum(each.failure is not None for each in cases)
+    counts = {
+        "tests": len(cases),
+        "failures": sum(each.failure is not None for each in cases),
+        "skipped": sum(bool(each.skipped) for each in cases),
+    }
     for element in (root, suite):
-        element.attrib |= {"tests": str(len(cases)), "failures": str(failures)}
+        element.attrib |= {key: str(value) for key, value in counts.items()}
     for case in cases:
         names = {"classname": lines(case.classname), "name": lines(case.name)}
         one = ET.SubElement(suite, "testcase", names)
@@ -53,6 +59,8 @@ def junit(name: str, cases: Sequence[Case], *, note: str = "") -> str:
             message, text = map(lines, case.failure)
             ET.SubElement(one, "failure", message=message).text = text
         _note(one, case.note)
+        if case.skipped:
+            ET.SubElement(one, "skipped", message=case.skipped)
     _note(suite, note)
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"

@@ -12,7 +12,7 @@ one error; its rule is `run.end` where no finding is to blame. Pure.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 from msgspec.structs import replace
@@ -138,25 +138,32 @@ _IDS = frozenset(each.id for each in RULES)
 
 
 def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> str:
-    """Write JUnit XML: a case for each finding, which fails if it refuses the system, and the end.
+    """Write JUnit XML: a case for the manifest, each rule and the end, the same whatever is found.
 
     Args:
-        verdict: gives the cases.
+        verdict: gives the results of the cases.
         plan: None where there is none, because the manifest cannot be used.
         strict: what cannot be verified refuses the system, whatever its policy says.
     """
-    cases = []
-    for each in verdict.findings:
-        refuses, text = _refuses(each, plan, strict=strict), _described(each)
-        cases.append(
-            Case(
-                classname=each.rule,
-                name=each.subject,
-                at=each.at,
-                failure=(each.message, text) if refuses else None,
-                note="" if refuses else text,
-            )
+
+    def case(classname: str, name: str, found: Sequence[Finding], skipped: str = "") -> Case:
+        bad = [each for each in found if _refuses(each, plan, strict=strict)]
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        return Case(
+            classname=classname,
+            name=name,
+            at=next((each.at for each in (*bad, *found)), ""),
+            failure=(bad[0].message + more, _described(bad)) if bad else None,
+            note=_described([each for each in found if each not in bad]),
+            skipped="" if found else skipped,
         )
+
+    by_rule: dict[str, list[Finding]] = {}
+    for each in verdict.findings:
+        by_rule.setdefault(each.rule if each.rule in _IDS else "", []).append(each)
+    skipped = "" if verdict.judged else "not judged; see the end of the run"
+    cases = [case("manifest", "the manifest is valid", by_rule.get("", ()))]
+    cases += [case(one.id, one.meaning, by_rule.get(one.id, ()), skipped) for one in RULES]
     flows = "".join(f"{_flow(each)}\n" for each in verdict.flows)
     name = f"lifecycle verify {plan.system}" if plan else "lifecycle verify"
     return junit(name, [*cases, _end(verdict)], note=flows)
@@ -184,8 +191,11 @@ def _end(verdict: Verdict) -> Case:
     return Case(classname="run", name="end", failure=(run.reason, text))
 
 
-def _described(finding: Finding) -> str:
-    return "".join(f"{line}\n" for line in _finding(finding, colour=False, width=100))
+def _described(findings: Iterable[Finding]) -> str:
+    return "\n".join(
+        "".join(f"{line}\n" for line in _finding(each, colour=False, width=100))
+        for each in findings
+    )
 
 
 def _flow(flow: FlowReport) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -27,7 +28,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text, to_github, to_json, to_junit, to_sarif
-from lifecycle.verify.rules import RULES
+from lifecycle.verify.rules import RULES, rule
 from lifecycle.verify.verdict import (
     NOT_JUDGED,
     Finding,
@@ -310,8 +311,13 @@ def test_the_last_line_of_a_run_says_why_it_ended_and_how_far_it_came():
 
 
 def test_a_run_that_nobody_judged_is_no_success_in_junit_and_sarif():
-    assert cases(UNJUDGED) == {"run/end": "failure"}
-    assert cases(replace(UNJUDGED, run=None)) == {"run/end": "failure"}
+    for each in (UNJUDGED, replace(UNJUDGED, run=None)):
+        came = cases(each)
+        assert (came.pop("run/end"), came.pop("manifest/the manifest is valid")) == (
+            "failure",
+            "passed",
+        )
+        assert set(came.values()) == {"skipped"}
     (run,) = json.loads(to_sarif(UNJUDGED))["runs"]
     assert [(each["ruleId"], each["level"]) for each in run["results"]] == [("run.end", "error")]
     assert run["invocations"] == [
@@ -328,13 +334,14 @@ def test_a_run_that_nobody_judged_is_no_success_in_junit_and_sarif():
 
 def cases(verdict: Verdict, plan: Plan | None = PLAN, *, strict: bool = False) -> dict[str, str]:
     """What each test case comes to, by its name."""
+    words = {"failure", "skipped"}
     root = ET.fromstring(to_junit(verdict, plan, strict=strict))
-    return {
-        f"{each.get('classname')}/{each.get('name')}": "failure"
-        if each.find("failure") is not None
-        else "passed"
+    found = [
+        (f"{each.get('classname')}/{each.get('name')}", words & {child.tag for child in each})
         for each in root.iter("testcase")
-    }
+    ]
+    assert len(dict(found)) == len(found)
+    return {name: "".join(tags) or "passed" for name, tags in found}
 
 
 INVALID = replace(
@@ -354,10 +361,25 @@ INVALID = replace(
 )
 
 
+def test_test_cases_have_the_same_names_whatever_the_outcome():
+    names = list(cases(after(unchanged)))
+    for edit in (NOT_DECLARED, change_report(PUB, "/robot/battery", dscp=None)):
+        assert list(cases(after(edit))) == names
+    assert list(cases(UNJUDGED)) == names
+    assert list(cases(INVALID, plan=None)) == names
+    assert sorted(names) == sorted(
+        [
+            "manifest/the manifest is valid",
+            *(f"{each.id}/{each.meaning}" for each in RULES),
+            "run/end",
+        ]
+    )
+
+
 def test_an_invalid_manifest_fails_where_it_is_wrong():
     root = ET.fromstring(to_junit(INVALID, None))
     case = next(root.iter("testcase"))
-    assert case.get("classname") == "manifest.unknown-key"
+    assert case.get("classname") == "manifest"
     assert (case.get("file"), case.get("line")) == ("robot.lifecycle.yaml", "4")
     assert case.find("failure").get("message") == "cannot use key 'nmae'"
     (result,) = json.loads(to_sarif(INVALID))["runs"][0]["results"]
@@ -410,19 +432,24 @@ def test_junit_escapes_what_xml_cannot_hold():
 
 def test_the_junit_of_findings_and_flows_is_spelled_so():
     done = RunEnd(reason="done", reached="active", exit_code=0)
-    text = to_junit(replace(WRITTEN, findings=(VIOLATED,), run=done), PLAN)
-    assert (
-        text
-        == """\
-<?xml version="1.0" encoding="UTF-8"?>
-<testsuites tests="2" failures="1">
-  <testsuite name="lifecycle verify robot" tests="2" failures="1">
-    <testcase classname="graph.qos-differs" name="/a" file="my robot:1.yaml" line="18">
-      <failure message="cannot accept this">violated graph.qos-differs: /a
+    text = to_junit(replace(WRITTEN, findings=(VIOLATED, VIOLATED), run=done), PLAN)
+    passed = re.compile(r'    <testcase classname="(?!run")[^"]*" name="[^"]*" />\n')
+    count = f'tests="{len(RULES) + 2}" failures="1" skipped="0"'
+    names = f'classname="graph.qos-differs" name="{rule("graph.qos-differs").meaning}"'
+    described = """violated graph.qos-differs: /a
   cannot accept this
   at        my robot:1.yaml:18:9
   to do     correct it
-</failure>
+"""
+    assert (
+        passed.sub("", text)
+        == f"""\
+<?xml version="1.0" encoding="UTF-8"?>
+<testsuites {count}>
+  <testsuite name="lifecycle verify robot" {count}>
+    <testcase {names} file="my robot:1.yaml" line="18">
+      <failure message="cannot accept this (and 1 more)">{described}
+{described}</failure>
     </testcase>
     <testcase classname="run" name="end">
       <system-out>ended after it was active, exit code 0: done
