@@ -24,9 +24,11 @@ from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
     Dscp,
+    EndpointKind,
     EndpointPolicy,
     Health,
     LinkKeys,
+    Name,
     Network,
     NodeKey,
     Parameter,
@@ -46,6 +48,7 @@ from lifecycle.manifest.model import (
     require,
     spelled,
 )
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
@@ -77,15 +80,10 @@ B = TypeVar("B", bound=Struct)
 
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
 
-Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
 Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namespace, as in /left")]
-Prefix = Annotated[
-    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
-]
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
-Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
 """What `if:` and `unless:` may be once their substitutions are resolved."""
@@ -241,6 +239,7 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def _interface_type(kind: str, example: str) -> Meta:
     message = f"write package/{kind}/Type, as in {example}"
     return Meta(
+        description=f"ROS type, package/{kind}/Type.",
         pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
         examples=[example],
         extra_json_schema={"patternErrorMessage": message},
@@ -261,11 +260,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One server or client of an action.
-
-    Attributes:
-        type: ROS type, package/action/Type.
-    """
+    """One server or client of an action."""
 
     type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
 
@@ -282,21 +277,13 @@ class QosEndpoint(Endpoint, frozen=True, kw_only=True):
 
 
 class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One server or client of a service.
-
-    Attributes:
-        type: ROS type, package/srv/Type.
-    """
+    """One server or client of a service."""
 
     type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
 
 
 class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One publisher or subscription.
-
-    Attributes:
-        type: ROS type, package/msg/Type.
-    """
+    """One publisher or subscription."""
 
     type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
@@ -316,39 +303,22 @@ Preset = Literal[
 """A QoS profile by its ROS name (rmw/qos_profiles.h)."""
 
 
-class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Qos(QosProfile, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """QoS profile, with rmw's names.
 
     What is left out is taken from 'preset', or from the default of the endpoint's kind.
 
     Attributes:
         preset: Preset by its ROS name (rmw/qos_profiles.h).
-        history: Which messages are kept.
-        depth: Messages kept under KEEP_LAST, at least 1.
-        reliability: Whether lost messages are sent again.
-        durability: Whether late subscriptions get earlier messages.
-        deadline_ns: Longest time between two messages, nanoseconds.
-        lifespan_ns: Age at which messages expire, nanoseconds.
-        liveliness: Who asserts that the publisher is alive.
-        liveliness_lease_duration_ns: Time without assertion after which a publisher counts as gone,
-            nanoseconds.
     """
 
     preset: Preset | None = None
-    history: Literal["SYSTEM_DEFAULT", "KEEP_LAST", "KEEP_ALL"] | None = None
-    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] | None = None
-    reliability: Literal["SYSTEM_DEFAULT", "RELIABLE", "BEST_EFFORT", "BEST_AVAILABLE"] | None = (
-        None
-    )
-    durability: (
-        Literal["SYSTEM_DEFAULT", "TRANSIENT_LOCAL", "VOLATILE", "BEST_AVAILABLE"] | None
-    ) = None
-    deadline_ns: Nanoseconds | None = None
-    lifespan_ns: Nanoseconds | None = None
-    liveliness: (
-        Literal["SYSTEM_DEFAULT", "AUTOMATIC", "MANUAL_BY_TOPIC", "BEST_AVAILABLE"] | None
-    ) = None
-    liveliness_lease_duration_ns: Nanoseconds | None = None
+    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 10
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is only observed."""
+        kinds = (self.history, self.reliability, self.durability, self.liveliness)
+        require(all(each.value != "UNKNOWN" for each in kinds))
 
 
 class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -424,21 +394,10 @@ class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     subscriptions: dict[str, SubscriptionFlow] = field(default_factory=dict)
 
 
-class MappedEndpoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Declared names of endpoints, by kind.
-
-    Attributes:
-        publishers, subscriptions: Names as the interface declares them.
-        service_servers, service_clients: Names as the interface declares them.
-        action_servers, action_clients: Names as the interface declares them.
-    """
-
-    publishers: tuple[Text, ...] = ()
-    subscriptions: tuple[Text, ...] = ()
-    service_servers: tuple[Text, ...] = ()
-    service_clients: tuple[Text, ...] = ()
-    action_servers: tuple[Text, ...] = ()
-    action_clients: tuple[Text, ...] = ()
+MappedNames = Annotated[
+    dict[EndpointKind, tuple[Text, ...]],
+    Meta(extra_json_schema={"propertyNames": {"enum": [each.value for each in EndpointKind]}}),
+]
 
 
 class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -446,7 +405,8 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         urls: Connection URLs: TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…].
-        map: Declared names of the endpoints that it carries; 'all' for every one of the node.
+        map: Declared names of the endpoints that it carries, by their list in the interface; 'all'
+            for every one of the node.
     """
 
     urls: Annotated[
@@ -458,7 +418,7 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ],
         ),
     ]
-    map: Literal["all"] | MappedEndpoints = MappedEndpoints()
+    map: Literal["all"] | MappedNames = field(default_factory=dict)
 
 
 class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -525,9 +485,6 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
             require(each.attach is not False and _written(each, each.ONE_OF) == 1)
 
 
-NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
-
-
 class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One other manifest.
 
@@ -545,7 +502,7 @@ class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     unless: Truth | None = None
     arguments: dict[Name, Scalar] = field(default_factory=dict)
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
 
 
 class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -570,7 +527,7 @@ class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True)
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     remap: dict[Text, Text] = field(default_factory=dict)
     groups: tuple[Group, ...] | None = None
-    nodes: NodesByKey | None = None
+    nodes: dict[Name, Node] | None = None
     include: tuple[Include, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -592,7 +549,7 @@ class Group(Shared, frozen=True, kw_only=True):
     if_: Truth | None = field(name="if", default=None)
     unless: Truth | None = None
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
     machine: Text | None = None
 
 

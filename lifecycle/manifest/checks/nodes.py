@@ -192,25 +192,15 @@ def _never_deactivated(node: Node) -> str:
 def _delays(node: Node) -> Iterator[Diagnostic]:
     """Judge the delays of a process that is started again."""
     how = node.supervision
-    longest = how.restart_max_delay_sec
-    if longest is not None and longest < how.restart_sec:
+    longest, grows = how.restart_max_delay_sec, how.restart_steps > 0
+    if grows is (longest is None) or (longest is not None and not 0 < how.restart_sec <= longest):
         message = (
-            f"cannot wait {longest:g} s at most: restart_sec is {how.restart_sec:g}, the shortest"
+            "cannot let the delay grow: it does from restart_sec, which is not 0, in restart_steps "
+            "to restart_max_delay_sec"
         )
-        at = node.where("restart_max_delay_sec")
-        yield error("check.restart", at, message, "set restart_max_delay_sec >= restart_sec")
-    elif longest is not None and longest > how.restart_sec and how.restart_steps == 0:
-        message = f"cannot let the delay grow to {longest:g} s: no restart_steps say how fast"
-        at = node.where("restart_max_delay_sec")
-        yield error("check.restart", at, message, "set 'restart_steps: 5' beside it")
-    if how.restart_steps and longest is None:
-        message = f"cannot let the delay grow in {how.restart_steps} steps: up to what is not said"
-        at = node.where("restart_steps")
-        yield error("check.restart", at, message, "set 'restart_max_delay_sec' beside it")
-    elif how.restart_steps and not how.restart_sec:
-        message = "cannot let the delay grow from 0 s: it grows by a factor"
-        at = node.where("restart_sec")
-        yield error("check.restart", at, message, "set 'restart_sec: 0.1' or more")
+        at = node.positions.get("restart_max_delay_sec", node.where("restart_steps"))
+        hint = "write 'restart_sec: 0.1', 'restart_steps: 5' and 'restart_max_delay_sec: 30'"
+        yield error("check.restart", at, message, hint)
     least_s = how.restart_sec * how.start_limit_burst
     interval_s = how.start_limit_interval_sec
     if interval_s and least_s > interval_s:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.interface import nearest_file
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.parameter_files import (
@@ -119,20 +119,6 @@ def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
     if any(each.name == name and each.default is not None for each in node.interface.parameters):
         return True
     return any(name == found for found, _, _ in system.files.given(node))
-
-
-def check_unused(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Say of values that an attached node is judged by that it is never given them."""
-    if node.run.kind is not RunKind.ATTACH or node.run.component:
-        return
-    own = [f"parameters.{name}" for name, _ in node.parameters]
-    places = [(place, "parameters") for place in own if place not in node.shared]
-    if node.parameter_files:
-        places.append(("parameter_files.0", "parameter files"))
-    for place, what in places[:1]:
-        message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
-        hint = "give them where it is started"
-        yield note("check.parameter-unused", node.where(place), message, hint)
 
 
 class CommandParameter(NamedTuple):
@@ -281,4 +267,4 @@ def _unknown_to_all(file: ParameterFile, readers: list[Node]) -> Iterator[Diagno
 
 
 CHECKS = (check_parameter_files, check_mode_parameters)
-OF_A_NODE = (check_parameters, check_unused, check_files_of_command)
+OF_A_NODE = (check_parameters, check_files_of_command)
