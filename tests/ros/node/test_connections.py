@@ -375,7 +375,7 @@ def test_what_is_asked_wrongly_is_refused_with_what_is_allowed(
         node.connect_to("upd://127.0.0.1", name="net")
     assert str(url.value) == (
         "cannot connect /it to 'net' (upd://127.0.0.1): cannot read connection URL "
-        "'upd://127.0.0.1': unknown transport 'upd'; allowed: udpv4, udpv6, udpm, tcpv4, shm; "
+        "'upd://127.0.0.1': unknown transport 'upd'; allowed: shm, udpv4, udpv6, udpm, tcpv4; "
         "write TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…], udpv4://10.77.0.1:7911"
     )
     own, failed = node.connections
