@@ -88,9 +88,7 @@ def _come(run: Run) -> list[Event]:
     if not waited and any(not each.level and advance.wanted(run, each) for each in nodes):
         return []
     run.came, run.again = False, run.held_s is not None
-    # Of a bring-up once: who is adopted, or appears, may be known one after the other.
-    is_said = run.furthest != "" and run.held_s is None
-    return [] if is_said else [reached(run, "connected")]
+    return [reached(run, "connected")]
 
 
 def _open(run: Run, passage: Passage) -> list[Event]:

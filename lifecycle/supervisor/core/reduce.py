@@ -204,7 +204,9 @@ def _replied(run: Run, given: messages.Replied) -> list[Event]:
     node.level = given.level
     if error:
         return _step_failed(run, node, step, error, goal)
-    if step in UP.values() and step is not Step.ACTIVATE:
+    # Nobody waits for plain nodes of others, which are found one after the other.
+    is_found = not node.process and advance.only_appears(node)
+    if step in UP.values() and step is not Step.ACTIVATE and not is_found:
         run.came = True
     if given.already and node.base is was and not node.process and not node.planned.run.component:
         node.base = node.level  # it was found so
