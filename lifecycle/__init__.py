@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from lifecycle.public import names
+
 if TYPE_CHECKING:
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
@@ -27,18 +29,11 @@ __all__ = [
     "run",
 ]
 
-_NODE = ("ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn")
-_HOME = {
-    **dict.fromkeys(_NODE, "node"),
-    "run": "host.standalone",
-}
-"""Module of `lifecycle.node` that has a name; of others `handlers`."""
-
-
-def __getattr__(name: str) -> object:
-    """Load the module of a public name on first use (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
-
-    return getattr(importlib.import_module(f"lifecycle.node.{_HOME.get(name, 'handlers')}"), name)
+__getattr__ = names(
+    __name__,
+    **{
+        "node.handlers": "on_action on_goal on_message on_service on_timer",
+        "node.host.standalone": "run",
+        "node.node": "ERROR FAILURE SUCCESS LifecycleNode TransitionCallbackReturn",
+    },
+)

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import sys
 
-from lifecycle.graph.graph import Graph
+from lifecycle.graph import Graph
 from lifecycle.manifest import load
-from lifecycle.plan.build import build_plan
-from lifecycle.verify.outcome import Outcome
+from lifecycle.plan import build_plan
+from lifecycle.verify import Outcome
 
 
 def main() -> int:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import signal
 import sys
 
-from lifecycle.graph.graph import Graph
-from lifecycle.graph.state import GraphEvent
+from lifecycle.graph import Graph, GraphEvent
 
 
 def appeared(event: GraphEvent) -> None:

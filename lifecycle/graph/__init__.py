@@ -4,3 +4,16 @@ Owns: node statuses and how they travel, the events made of them, and the state 
 (docs/graph_interface.md), of which the supervisor and `lifecycle verify` judge an observation. Must
 not use ctypes or private rclpy names; those live in middleware/.
 """
+
+from __future__ import annotations
+
+from lifecycle.public import names
+
+__getattr__ = names(
+    __name__,
+    graph="Graph",
+    model="End GraphChange Link NodeView",
+    reporter="GraphReporter receive",
+    state="EventKind GraphEvent GraphEvents GraphState",
+    status="MappingStatus NodeStatus NodeStatusError decode encode new_instance",
+)

@@ -6,16 +6,6 @@ Other packages use the types of `model`, `qos` and `diagnostics`; nothing outsid
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from lifecycle.public import names
 
-if TYPE_CHECKING:
-    from lifecycle.manifest.loading import load as load
-
-
-def __getattr__(name: str) -> object:
-    """Load `load` on first use (PEP 562): who needs a type of this room alone reads no YAML."""
-    if name != "load":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from lifecycle.manifest.loading import load
-
-    return load
+__getattr__ = names(__name__, loading="load")

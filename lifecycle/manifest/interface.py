@@ -309,8 +309,10 @@ class _NodlReading:
             path = base / body
             if os.path.exists(path):
                 return path
-            message = f"cannot find {reference!r}: there is no file {str(path)!r}"
-            self._error("not-found", at, message, nearest_file(path))
+            why = f"there is no file {str(path)!r}"
+            if path.is_symlink():
+                why = f"the symbolic link {str(path)!r} leads to no file"
+            self._error("not-found", at, f"cannot find {reference!r}: {why}", nearest_file(path))
         elif scheme != "nodl":
             message = f"cannot follow {reference!r}; write local://PATH or nodl://PACKAGE/NAME"
             self._error("reference", at, message)
@@ -334,7 +336,9 @@ class _NodlReading:
 def nearest_file(path: Path) -> str:
     """Return a hint that names the file of the same kind with the nearest name in that folder."""
     stem, _, kind = path.name.partition(".")
-    files = [each.name.partition(".") for each in path.parent.glob(f"*.{kind}")]
+    # A symbolic link that leads nowhere, or to itself, is there.
+    others = (each for each in path.parent.glob(f"*.{kind}") if each.name != path.name)
+    files = [each.name.partition(".") for each in others]
     stems = {each: f"{each}{dot}{rest}" for each, dot, rest in files if rest == kind}
     found = nearest(stem, sorted(stems))
     return f"did you mean {stems[found]!r}?" if found else ""

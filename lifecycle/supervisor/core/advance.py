@@ -130,9 +130,15 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
     if target is Level.CONNECTED and run.wires and not node.wired:
         # What a negotiation asks of a node must not wait for a connection of another.
         early = (run.nodes[key] for key in run.early if key in run.nodes)
-        late = (each.name for each in early if each.level < Level.CONFIGURED)
-        return next((f"{name} is configured" for name in late), "")
+        late = (each for each in early if each.level < Level.CONFIGURED)
+        return next((f"{each.name} is configured" for each in late if _comes(run, each)), "")
     return ""
+
+
+def _comes(run: Run, node: Node) -> bool:
+    """Return whether a node that is down is to be started again."""
+    process = run.process_of(node)
+    return process is None or not process.stays_down
 
 
 def _awaited(run: Run, after: After) -> str:

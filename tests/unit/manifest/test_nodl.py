@@ -257,6 +257,17 @@ def test_a_missing_file_is_reported_at_the_reference_with_the_nearest_name(tmp_p
     ]
 
 
+def test_a_link_to_itself_is_no_file_and_not_the_one_that_was_meant(tmp_path: Path) -> None:
+    (tmp_path / "camra.nodl.yaml").symlink_to("camra.nodl.yaml")
+    _, (found,) = followed("local://camra.nodl.yaml", base=tmp_path, at=AT)
+    link = tmp_path / "camra.nodl.yaml"
+    why = f"the symbolic link {str(link)!r} leads to no file"
+    assert (found.message, found.hint) == (f"cannot find 'local://camra.nodl.yaml': {why}", "")
+    (tmp_path / "camera.nodl.yaml").write_text(publisher("a"))
+    _, (found,) = followed("local://camra.nodl.yaml", base=tmp_path, at=AT)
+    assert found.hint == "did you mean 'camera.nodl.yaml'?"
+
+
 @pytest.fixture
 def prefix(tmp_path: Path) -> Path:
     index = tmp_path / "share" / "ament_index" / "resource_index" / "nodl"

@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest.model import Condition, RunKind, TargetState
+from lifecycle.manifest.model import Condition, Run, RunKind, TargetState
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.run.options import Until
@@ -70,6 +70,18 @@ async def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(
     assert requests(world, "/arm") == ["activate", "deactivate"]
     assert requests(world, "/new") == ["configure", "activate", "deactivate", "cleanup"]
     assert world.graph.others == FOUND
+
+
+async def test_a_system_of_which_all_is_found_one_after_the_other_is_connected_once(
+    tmp_path: Path,
+) -> None:
+    names = ("arm", "new", "logger")
+    command = Run(kind=RunKind.COMMAND)
+    plain = (replace(planned_node(each, managed=False), run=command) for each in names)
+    world = world_of(tmp_path, plan_of(*plain), stop_after_s=3.0)
+    world.graph.others = dict.fromkeys((f"/{each}" for each in names), "")
+    await world.run()
+    assert [each.startswith("[system] connected") for each in world.story].count(True) == 1
 
 
 LIDAR = planned_node("lidar")

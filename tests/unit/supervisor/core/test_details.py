@@ -204,6 +204,17 @@ def test_no_node_is_wired_before_those_are_configured_that_come_early() -> None:
     assert "a wire" in play.finish("b configure")
 
 
+def test_who_stays_down_of_those_that_come_early_holds_up_nobodys_wiring() -> None:
+    plan = plan_of(planned_node("a", supervision=AGAIN), planned_node("b"))
+    negotiated = replace(plan.data_layer, authority=Authority.SUPERVISOR)
+    play = Play(replace(plan, data_layer=negotiated), keep_going=True, stop_after_s=60.0)
+    play.run.early = frozenset({"b"})
+    play.die("b")
+    play.die("a")
+    assert "a wire" in play.wait(5.0)
+    assert play.run.nodes["a"].level is Level.ACTIVE
+
+
 def test_a_node_of_others_that_was_disconnected_is_wired_anew() -> None:
     plan = plan_of(planned_node("a", kind=RunKind.ATTACH), planned_node("b"))
     wired = replace(plan.data_layer, authority=Authority.SUPERVISOR)
