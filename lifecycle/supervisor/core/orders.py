@@ -42,9 +42,6 @@ FITS = {
 }
 """In which phases an order can begin, and what is said in any other."""
 
-STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
-"""Orders that start processes."""
-
 
 def refusal(run: Run, order: Order) -> str:
     """Return why an order cannot be carried out now; empty if it can."""

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import ended
 from lifecycle.manifest.model import RunKind
-from lifecycle.middleware.process.busy_sign import Overdue
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -48,7 +47,6 @@ class Cause(enum.Enum):
 
     STOPPED = "stopped"
     HUNG = "hung"
-    UNSERVED = "unserved"
     LOST = "lost"
     REPORTED = "told"
 
@@ -144,13 +142,11 @@ class SilenceMonitor:
             self._silent.pop(name, None)
             self._unanswering.pop(name, None)
 
-    def watch_over(
-        self, process: ManagedProcess, nodes: Iterable[str]
-    ) -> Callable[[Overdue | None], None]:
+    def watch_over(self, process: ManagedProcess, nodes: Iterable[str]) -> Callable[[bool], None]:
         """Follow a process that is about to be spawned.
 
         Returns:
-            What its control channel calls when its executor is busy for too long, or came back.
+            What its control channel calls when its executor hangs, or came back.
         """
         names = tuple(nodes)
 
@@ -158,11 +154,9 @@ class SilenceMonitor:
             why = f"its process {process.name!r} (pid {process.pid}) was stopped by a signal"
             self.note(names, Cause.STOPPED, why if is_stopped else "")
 
-        def hung(why: Overdue | None) -> None:
-            where = f"its process {process.name!r} (pid {process.pid})"
-            hangs = unserved = ""
-            busy_s = 0.0
-            if why is Overdue.HANGS:
+        def hung(is_hung: bool) -> None:
+            hangs, busy_s = "", 0.0
+            if is_hung:
                 assert process.channel is not None
                 assert process.channel.sign is not None
                 sign = process.channel.sign
@@ -170,15 +164,10 @@ class SilenceMonitor:
                 what = f" {sign.what}" if sign.what else ""
                 at = process.where()
                 hangs = (
-                    f"a callback{what} in {where} has been running for more than {limit_s:g} s"
-                    f"{at and f', in {at}'}"
+                    f"a callback{what} in its process {process.name!r} (pid {process.pid}) has "
+                    f"been running for more than {limit_s:g} s{at and f', in {at}'}"
                 )
-            elif why is Overdue.UNSERVED:
-                unserved = f"{where} gets no processor for its callback: the machine is overloaded"
-            if unserved:  # they are silent all the while, if for another reason
-                self.note(names, Cause.UNSERVED, unserved)
             self.note(names, Cause.HUNG, hangs, busy_s=busy_s)
-            self.note(names, Cause.UNSERVED, unserved)
 
         process.on_stop = stopped
         process.ended.add_done_callback(lambda _: self.forget(names))

@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import (
     OWN_CHILD,
     PROCESS_VARIABLE,
@@ -39,7 +38,6 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
-    SERVES,
     ChildReport,
     ForkRequest,
     ForkServerProcess,
@@ -67,9 +65,6 @@ _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
 
 _LOOK_S = 0.02
-
-_READY_S = 10.0
-"""A fork server serves after 0.2 s; a loaded machine takes longer."""
 
 _HOST = "lifecycle.node.host.host"
 
@@ -103,9 +98,7 @@ class ForkServer:
         self._next = 0
         # Of a shell that became this process by exec: no part of the run.
         self._foreign = Lineage().children(os.getpid())
-        self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
-        self._serves = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
         process.socket.setblocking(False)
         self._loop.add_reader(process.socket, self._reports)
@@ -128,19 +121,6 @@ class ForkServer:
             # What it had adopted, and what it had started, is ours now.
             roots |= lineage.children(os.getpid()) - self._foreign
         return frozenset().union(*map(lineage.of, roots)) - {self.pid}
-
-    async def ready(self) -> None:
-        """Have the fork server answer, bounded.
-
-        Raises:
-            BringUpError: it does not, or has died.
-        """
-        self._serves.clear()
-        self._ask(SERVES.encode())
-        if not await set_within(self._serves, _READY_S):
-            raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
-        if self.died.done():
-            raise BringUpError(self.died.result())
 
     def _ask(self, message: bytes, descriptors: Sequence[int] = ()) -> None:
         """Send a message; raises BringUpError if it has died, or cannot be asked."""
@@ -206,8 +186,8 @@ class ForkServer:
                 signal.pidfd_send_signal(pidfd, number)
 
     def run_delay_s(self, pid: int) -> float:
-        """Return how long a process and its descendants have waited for a processor."""
-        return sum(map(run_delay_s, self._lineage.of(pid)))
+        """Return how long the main thread of a process has waited for a processor."""
+        return run_delay_s(str(pid))
 
     def belonging(self, processes: Mapping[int, str]) -> set[int]:
         """Return the pids of all that processes have started, whether they live or not.
@@ -264,9 +244,7 @@ class ForkServer:
 
     def _take(self, report: ChildReport, descriptors: list[int]) -> None:
         child = self._children.get(report.id)
-        if report.id == 0:
-            self._serves.set()
-        elif report.id in self._pending:
+        if report.id in self._pending:
             self._born(report, descriptors)
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
@@ -316,7 +294,6 @@ class ForkServer:
         end = ProcessExit.of(self._process.popen.wait())
         self._reports()
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {end}")
-        self._serves.set()
         for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))

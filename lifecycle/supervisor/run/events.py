@@ -116,8 +116,8 @@ class NodeSilent(Event, frozen=True, kw_only=True, tag="silent"):
     """Nothing can be expected of a node any more, though it has not left.
 
     Attributes:
-        cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
-            "lost" from the network, or "told" by its own supervisor.
+        cause: "stopped" by a signal, "hung" in a callback, "lost" from the network, or "told" by
+            its own supervisor.
     """
 
     node: str

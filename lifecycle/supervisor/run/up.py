@@ -11,7 +11,6 @@ import contextlib
 import gc
 import os
 import re
-import time
 import traceback
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
@@ -76,7 +75,6 @@ from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
-    address_that_is_down,
     local_processes,
     observer_connections,
     own_machines,
@@ -176,7 +174,7 @@ def up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server)
-                observer_participant = await _observer_participant(plan, options, emit, ending)
+                observer_participant = await _observer_participant(plan, options, emit)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 await _adopt(system, observer_participant)
                 emit(
@@ -268,29 +266,12 @@ within milliseconds, one that sends nothing perhaps never. Then the port stays f
 
 
 _SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
-_INTERFACE_S = 0.05
-
-
-async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) -> None:
-    """Wait, bounded, before any participant is made that would never use this host's address."""
-    deadline_s = time.monotonic() + options.bring_up_s(0)
-    said = ""
-    while (address := address_that_is_down(plan, options.machine)) and (
-        time.monotonic() < deadline_s
-    ):
-        if address != said:
-            said = address
-            message = f"waits until the network interface with {address} is up: what is made before"
-            emit(Notice(message=f"{message} would not be found from other machines"))
-        await asyncio.sleep(_INTERFACE_S)
 
 
 async def _observer_participant(
-    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
+    plan: Plan, options: UpOptions, emit: Emitter
 ) -> ObserverParticipant:
     """Make the supervisor's participant."""
-    with ending.raised():
-        await _until_interface_is_up(plan, options, emit)
     # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
     load_type_support("rcl_interfaces/msg/ParameterEvent")
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant

@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
@@ -359,10 +358,6 @@ class FakeForkServer:
             )
         self.interfaces[command.node] = interface
         return interface
-
-    async def ready(self) -> None:
-        if self.cannot_start:
-            raise BringUpError(self.cannot_start)
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
