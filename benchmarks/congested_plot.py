@@ -14,6 +14,7 @@ import argparse
 import csv
 import dataclasses
 import math
+import signal
 import sys
 import tempfile
 import time
@@ -62,7 +63,7 @@ def record(file: Path) -> float:
         router.ip("link", "set", "right", "txqueuelen", str(frames))
         manifest = write_manifest(CASE, left.ipv4, right.ipv4, directory)
         with brought_up(manifest, left, right, directory):
-            options = ("--record", str(file), "--force", "--for", f"{2 * EACH_S:g}")
+            options = ("--record", str(file))
             recording = right.popen(
                 *PYTHON, "flows", "congested", *options, env=right.environment(directory / "b")
             )
@@ -72,7 +73,9 @@ def record(file: Path) -> float:
                 time.sleep(EACH_S)
             applied_s = time.monotonic() - began_s
             with rule(CASE, router, manifest, directory):
-                recording.wait(UP_S + EACH_S)
+                time.sleep(EACH_S)
+                recording.send_signal(signal.SIGINT)
+                recording.wait(UP_S)
         return applied_s
 
 

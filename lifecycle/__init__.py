@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from lifecycle.public import public_name
 
 if TYPE_CHECKING:
-    from lifecycle.node.callbacks import GoalInterruptedError
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
     from lifecycle.node.node import ERROR, FAILURE, SUCCESS, LifecycleNode, TransitionCallbackReturn
@@ -20,7 +19,6 @@ __all__ = [
     "ERROR",
     "FAILURE",
     "SUCCESS",
-    "GoalInterruptedError",
     "LifecycleNode",
     "TransitionCallbackReturn",
     "on_action",
@@ -33,7 +31,6 @@ __all__ = [
 
 
 _PUBLIC: dict[str, tuple[str, ...]] = {
-    "lifecycle.node.callbacks": ("GoalInterruptedError",),
     "lifecycle.node.handlers": (
         "on_action",
         "on_goal",

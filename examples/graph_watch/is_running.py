@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from lifecycle.graph import Graph
+from lifecycle.graph.graph import Graph
 from lifecycle.manifest import load
 from lifecycle.plan import build_plan
 from lifecycle.verify import Outcome

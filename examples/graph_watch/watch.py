@@ -10,7 +10,8 @@ from __future__ import annotations
 import signal
 import sys
 
-from lifecycle.graph import Graph, GraphEvent
+from lifecycle.graph.graph import Graph
+from lifecycle.graph.state import GraphEvent
 
 
 def appeared(event: GraphEvent) -> None:

@@ -251,30 +251,22 @@ RECORDED = ("time", "seconds", "topic", "publisher", "subscription", *NUMBERS, "
 
 
 class Record:
-    """A CSV file that gets a row for each flow again and again; `close` it.
+    """A CSV file, in the place of any of its name, that gets a row for each flow again and again.
 
     Attributes:
         path: of the file.
         rows: how many were written.
 
-    Args:
-        replaces: it may be there already.
-
     Raises:
-        UsageError: it is there, or cannot be written.
+        UsageError: it cannot be written.
     """
 
-    def __init__(self, path: Path, *, replaces: bool) -> None:
+    def __init__(self, path: Path) -> None:
         self.rows = 0
         self.path = path
         self._began_s = time.monotonic()
         try:
-            self._file = path.open("w" if replaces else "x", encoding="utf-8", newline="")
-        except FileExistsError as error:
-            raise UsageError(
-                f"cannot record into {str(path)!r}: it is there already",
-                hint="name another file, or replace it with --force",
-            ) from error
+            self._file = path.open("w", encoding="utf-8", newline="")
         except (OSError, ValueError) as error:
             raise unwritable(self.path, error) from error
         self._writer = csv.writer(self._file, lineterminator="\n")

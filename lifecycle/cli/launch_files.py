@@ -22,8 +22,6 @@ import msgspec
 
 from lifecycle.errors import UsageError
 from lifecycle.export.manifest_yaml import Noted, Tree, comment, kept, literal, to_yaml
-from lifecycle.export.programs import LOG_LEVELS
-from lifecycle.manifest.model import ParameterValue
 from lifecycle.manifest.names import free_name
 
 
@@ -32,22 +30,14 @@ class LaunchedNode(msgspec.Struct, kw_only=True):
 
     Attributes:
         name: empty where the node's code chooses it.
-        run: as the manifest has it.
-        restart: `restart` and its like, as the manifest has them.
-        parameters: (name, value), later ones win.
+        keys: of the manifest.
         container: full name of the component container that loads it; empty for a process.
         gaps: what a manifest cannot say of it, or launch does not say.
     """
 
     name: str
     namespace: str
-    run: dict[str, Tree]
-    managed: bool
-    restart: dict[str, Tree] = msgspec.field(default_factory=dict)
-    parameter_files: list[str] = msgspec.field(default_factory=list)
-    parameters: dict[str, ParameterValue] = msgspec.field(default_factory=dict)
-    remap: dict[str, str] = msgspec.field(default_factory=dict)
-    log_level: str = ""
+    keys: dict[str, Tree]
     container: str = ""
     gaps: list[str] = msgspec.field(default_factory=list)
 
@@ -70,8 +60,13 @@ class Launched(msgspec.Struct, kw_only=True):
     gaps: list[str] = msgspec.field(default_factory=list)
 
 
-def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
+def evaluate(path: Path, arguments: Mapping[str, str], *, folder: Path) -> Launched:
     """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
+
+    Args:
+        path: of the launch file.
+        arguments: of it.
+        folder: of the manifest, from which its paths start.
 
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
@@ -91,9 +86,8 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     before = dict(os.environ)
     # launch_ros looks nowhere without it; wheels of ROS packages are below sys.prefix.
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
-    walk = _Walk(
-        launch.LaunchContext(argv=[f"{name}:={value}" for name, value in arguments.items()])
-    )
+    argv = [f"{name}:={value}" for name, value in arguments.items()]
+    walk = _Walk(launch.LaunchContext(argv=argv), folder)
     try:
         walk.begin(path, arguments)
     except Exception as problem:
@@ -126,9 +120,10 @@ _NEVER = (
 class _Walk:
     """One walk over a launch description, depth first, in the order in which launch acts."""
 
-    def __init__(self, context: Any) -> None:
+    def __init__(self, context: Any, folder: Path) -> None:
         self.found = Launched()
         self._context = context
+        self._folder = folder
         self._environment = dict(os.environ)
 
     def begin(self, path: Path, arguments: Mapping[str, str]) -> None:
@@ -206,37 +201,40 @@ class _Walk:
         if text not in self.found.gaps:
             self.found.gaps.append(text)
 
-    # -- nodes
-
     def _node(self, action: Any, kinds: Sequence[str], notes: tuple[str, ...]) -> None:
-        node = LaunchedNode(
-            name=self._text(_private(action, "node_name")),
-            namespace=self._namespace(_private(action, "node_namespace")),
-            run=self._run(action),
-            managed="LifecycleNode" in kinds,
-            gaps=[*notes],
-        )
-        self._settings(node, _private(action, "parameters"), _private(action, "remappings"))
-        self._ros_arguments(node, action)
+        gaps = [*notes]
+        keys = self._settings(_private(action, "parameters"), _private(action, "remappings"), gaps)
         if self._is_true(_private(action, "respawn")):
-            node.restart["restart"] = "always"
+            keys["restart"] = "always"
             delay_s = _private(action, "respawn_delay")
             if isinstance(delay_s, (int, float)):
-                node.restart["restart_sec"] = delay_s
-            most = _private(action, "respawn_max_retries")
-            if isinstance(most, int) and most >= 0:
-                node.gaps.append(
-                    f"respawn_max_retries {most}: `start_limit_burst` counts starts within a time"
-                )
-        if self._is_true(_private(action, "shell") or getattr(action, "shell", None)):
-            node.gaps.append("shell: a manifest has nothing like it")
-        if getattr(getattr(action, "process_description", None), "env", None):
-            node.gaps.append("env: launch gives it these variables alone, here they are added")
-        if _private(action, "on_exit"):
-            node.gaps.append("on_exit: what its end does to others is the supervisor's")
-        self.found.nodes.append(node)
+                keys["restart_sec"] = delay_s
+        if "LifecycleNode" not in kinds:
+            keys["managed"] = _MANAGED
+        if words := [self._text(each) for each in _private(action, "ros_arguments") or ()]:
+            gaps.append(f"ROS arguments {shlex.join(words)}: see remap, parameters and log_level")
+        description = getattr(action, "process_description", None)
+        said = {
+            "respawn_max_retries": (_private(action, "respawn_max_retries") or -1) >= 0,
+            "shell": self._is_true(_private(action, "shell") or getattr(action, "shell", None)),
+            "env, which are its only variables there": getattr(description, "env", None),
+            "on_exit": _private(action, "on_exit"),
+        }
+        gaps += [f"{name}: a manifest has nothing like it" for name, is_so in said.items() if is_so]
+        node = self._add(action, "node_name", "node_namespace", {"run": self._run(action), **keys})
+        node.gaps += gaps
         for each in _private(action, "composable_node_descriptions") or ():
             self._component(each, node.full_name, notes)
+
+    def _add(
+        self, described: Any, name: str, namespace: str, keys: dict[str, Tree]
+    ) -> LaunchedNode:
+        written = _private(described, name), _private(described, namespace)
+        node = LaunchedNode(
+            name=self._text(written[0]), namespace=self._namespace(written[1]), keys=keys
+        )
+        self.found.nodes.append(node)
+        return node
 
     def _is_true(self, value: Any) -> bool:
         return value is not None and self._text(value).lower() in ("true", "1")
@@ -285,82 +283,54 @@ class _Walk:
         base = self._context.launch_configurations.get("ros_namespace")
         return str(names.make_namespace_absolute(names.prefix_namespace(base, own)) or "/")
 
-    def _settings(self, node: LaunchedNode, parameters: Any, remappings: Any) -> None:
+    def _settings(self, parameters: Any, remappings: Any, gaps: list[str]) -> dict[str, Tree]:
+        """Return parameter files, parameters and remaps, also those that launch gives to all."""
+        values: dict[str, Tree] = {}
+        files: list[Tree] = []
         given = [*(self._context.launch_configurations.get("global_params") or ())]
         for each in given + (self._evaluated(parameters) if parameters else []):
-            if isinstance(each, tuple):
-                self._parameter(node, *each)
-            elif isinstance(each, Mapping):
-                for name, value in each.items():
-                    self._parameter(node, name, value)
-            elif isinstance(each, (str, os.PathLike)):
-                self._file(node, str(each))
+            if isinstance(each, (str, os.PathLike)):
+                name = Path(each).name
+                if Path(each).parent == Path(tempfile.gettempdir()):
+                    # launch writes a parameter file with substitutions to a temporary one.
+                    gaps.append(f"{each}: a parameter file with substitutions; write it out")
+                if values:
+                    gaps.append(f"launch lets {name} win over parameters before it; here they win")
+                files.append(literal(os.path.relpath(each, self._folder)))
             else:
-                self._parameter(node, *each.evaluate(self._context))
+                one = each if isinstance(each, (tuple, Mapping)) else each.evaluate(self._context)
+                for name, value in one.items() if isinstance(one, Mapping) else [one]:
+                    is_list = isinstance(value, (list, tuple))
+                    values[name] = list(map(literal, value)) if is_list else literal(value)
+        remap: dict[str, Tree] = {}
         rules = [*(self._context.launch_configurations.get("ros_remaps") or ())]
-        rules += [(self._text(source), self._text(target)) for source, target in remappings or ()]
-        for source, target in rules:
-            node.remap.setdefault(source, target)  # rcl takes the first that matches
+        for source, target in (*rules, *(remappings or ())):
+            # rcl takes the first that matches.
+            remap.setdefault(self._text(source), literal(self._text(target)))
+        return {"parameter_files": files, "parameters": values, "remap": remap}
 
     def _evaluated(self, parameters: Any) -> list[Any]:
         utilities = importlib.import_module("launch_ros.utilities")
         return list(utilities.evaluate_parameters(self._context, parameters))
 
-    def _parameter(self, node: LaunchedNode, name: str, value: Any) -> None:
-        if isinstance(value, (list, tuple)):
-            node.parameters[name] = tuple(value)
-        elif isinstance(value, (bool, int, float, str)):
-            node.parameters[name] = value
-        else:
-            node.gaps.append(f"parameter {name}: its value is no ROS value")
-
-    def _file(self, node: LaunchedNode, path: str) -> None:
-        if Path(path).parent == Path(tempfile.gettempdir()):
-            # launch writes a parameter file with substitutions to a temporary one.
-            node.gaps.append(f"{path}: a parameter file with substitutions; write it out, name it")
-        if node.parameters:
-            node.gaps.append(
-                f"launch lets {Path(path).name} win over parameters before it; here they win"
-            )
-        node.parameter_files.append(path)
-
-    def _ros_arguments(self, node: LaunchedNode, action: Any) -> None:
-        words = [self._text(each) for each in _private(action, "ros_arguments") or ()]
-        rest = iter(words)
-        for word in rest:
-            value = next(rest, "") if word in ("--log-level", "-r", "--remap") else ""
-            source, separator, target = value.partition(":=")
-            if word == "--log-level" and value.lower() in LOG_LEVELS:
-                node.log_level = value.lower()
-            elif word in ("-r", "--remap") and separator:
-                node.remap.setdefault(source, target)
-            else:
-                node.gaps.append(f"ROS argument {' '.join(filter(None, (word, value)))}")
-
-    # -- components
-
     def _component(self, described: Any, container: str, notes: tuple[str, ...]) -> None:
         if not self._holds(described.condition()):
             return
-        package, plugin = self._text(described.package), self._text(described.node_plugin)
-        node = LaunchedNode(
-            name=self._text(described.node_name),
-            namespace=self._namespace(described.node_namespace),
-            run={"component": f"{package}/{plugin}"},
-            managed=False,
-            container=container,
-            gaps=[*notes],
-        )
-        self._settings(node, described.parameters, described.remappings)
-        if described.extra_arguments:
-            extra: dict[str, Tree] = {}
-            for each in self._evaluated(described.extra_arguments):
-                if isinstance(each, Mapping):
-                    extra.update(each)
-                else:
-                    node.gaps.append("extra_arguments: those of a file are missing")
-            node.run["extra_arguments"] = extra
-        self.found.nodes.append(node)
+        gaps = [*notes]
+        run: dict[str, Tree] = {
+            "component": f"{self._text(described.package)}/{self._text(described.node_plugin)}"
+        }
+        extra: dict[str, Tree] = {}
+        for each in self._evaluated(described.extra_arguments or ()):
+            if isinstance(each, Mapping):
+                extra.update(each)
+            else:
+                gaps.append("extra_arguments: those of a file are missing")
+        keys = self._settings(described.parameters, described.remappings, gaps)
+        keys |= {"run": kept({**run, "extra_arguments": extra}), "managed": _MANAGED}
+        node = self._add(described, "node_name", "node_namespace", keys)
+        node.container = container
+        node.gaps += gaps
 
     # -- values
 
@@ -398,7 +368,6 @@ def to_launched_manifest(
     *,
     source: str,
     system: str,
-    folder: Path,
     schema: str = "manifest.v1.schema.json",
 ) -> str:
     """Return what a launch file describes as a manifest, gaps marked.
@@ -407,18 +376,11 @@ def to_launched_manifest(
         found: what it says.
         source: how the launch file is named in the first lines.
         system: name to give the system.
-        folder: of the manifest, from which its paths start.
         schema: where editors find the manifest's schema, a path or URL.
     """
     keys = _keys(found.nodes)
     by_name = {node.full_name: key for node, key in zip(found.nodes, keys, strict=True)}
-    every = [node.parameters.get("use_sim_time") for node in found.nodes]
-    shared: dict[str, Tree] = {}
-    if isinstance(every[0], bool) and every == [every[0]] * len(every):
-        shared["use_sim_time"] = every[0]
-        for node in found.nodes:
-            del node.parameters["use_sim_time"]
-    nodes = {key: _tree(node, by_name, folder) for node, key in zip(found.nodes, keys, strict=True)}
+    nodes = {key: _tree(node, by_name) for node, key in zip(found.nodes, keys, strict=True)}
     head = [
         f"# yaml-language-server: $schema={schema}",
         comment(f"Imported from {source}: evaluated, and never run. `gap:` marks what is missing."),
@@ -432,7 +394,6 @@ def to_launched_manifest(
             value={"unpublished": "ignore", "unheard": "ignore"},
             note="as long as interfaces are missing",
         ),
-        **shared,
         "nodes": nodes,
     }
     return "\n".join(head) + "\n" + to_yaml(tree)
@@ -441,10 +402,9 @@ def to_launched_manifest(
 def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
     keys: list[str] = []
     for node in nodes:
-        executable = node.run.get("executable") or node.run.get("component") or ""
-        if not executable and isinstance(node.run.get("command"), list):
-            executable = node.run["command"][0]  # type: ignore[index]
-        base = node.name or Path(str(executable)).name.rpartition("::")[2] or "node"
+        run: Any = node.keys["run"]
+        program = run.get("executable") or run.get("component") or run["command"][0]
+        base = node.name or Path(program).name.rpartition("::")[2] or "node"
         base = re.sub(r"\W", "_", base, flags=re.ASCII)
         base = base if base[0].isalpha() or base[0] == "_" else f"_{base}"
         in_namespace = "_".join(filter(None, (*node.namespace.strip("/").split("/"), base)))
@@ -452,33 +412,28 @@ def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
     return keys
 
 
-def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
-    container = {"container": by_name.get(node.container, node.container)} if node.container else {}
+_MANAGED = Noted(
+    value=False,
+    note="gap: launch does not say whether it has a lifecycle; remove this line if it has",
+)
+_OPEN = Noted(
+    value="open",
+    note="gap: a launch file says nothing of its interface: lifecycle capture shows it once it "
+    "runs",
+)
+
+
+def _tree(node: LaunchedNode, by_name: Mapping[str, str]) -> Tree:
+    run: Any = node.keys["run"]
+    if node.container:
+        run = {**run, "container": by_name.get(node.container, node.container)}
+    # The name is written even if it is the key: only then a command is given it.
+    namespace = "" if node.namespace == "/" else node.namespace
+    named = {"run": run, "name": node.name, "namespace": namespace}
+    tree = kept({**named, **node.keys, "run": run, "endpoints": _OPEN})
     gaps = [*node.gaps]
     if not node.name:
         gaps.insert(0, "launch leaves its name to its code; the key must be that name")
-    unknown = "launch does not say whether it has a lifecycle; remove this line if it has"
-    silent = "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
-    tree = kept(
-        {
-            "run": {**node.run, **container},
-            # Written even if it is the key: only then a command is given it.
-            "name": node.name,
-            "namespace": "" if node.namespace == "/" else node.namespace,
-            "managed": None if node.managed else Noted(value=False, note=f"gap: {unknown}"),
-            "parameter_files": [
-                literal(os.path.relpath(each, folder)) for each in node.parameter_files
-            ],
-            "parameters": {
-                name: list(map(literal, value)) if isinstance(value, tuple) else literal(value)
-                for name, value in node.parameters.items()
-            },
-            "remap": {source: literal(target) for source, target in node.remap.items()},
-            "log_level": node.log_level,
-            **node.restart,
-            "endpoints": Noted(value="open", note=f"gap: {silent}"),
-        }
-    )
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
 
 

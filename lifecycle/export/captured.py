@@ -30,7 +30,7 @@ from lifecycle.manifest.names import (
 )
 from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.manifest.qos import History, QosProfile
-from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
@@ -83,7 +83,6 @@ class CapturedNode(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         key: for a manifest, unique in the system.
-        machine: name of its CapturedMachine; empty if there is only one or it is not known.
         managed: it offers the lifecycle services.
         state: lifecycle_msgs/State label; empty if not known.
         parameters: None where it did not answer.
@@ -96,7 +95,6 @@ class CapturedNode(msgspec.Struct, frozen=True, kw_only=True):
     key: str
     name: str
     namespace: str
-    machine: str
     managed: bool
     state: str
     endpoints: tuple[CapturedEndpoint, ...]
@@ -114,14 +112,6 @@ class CapturedNode(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
 
-class CapturedMachine(msgspec.Struct, frozen=True, kw_only=True):
-    """A machine that nodes of ours named; `address` is empty if none of them reported one."""
-
-    name: str
-    machine_id: str
-    address: str
-
-
 class CapturedSystem(msgspec.Struct, frozen=True, kw_only=True):
     """A whole running system.
 
@@ -134,7 +124,6 @@ class CapturedSystem(msgspec.Struct, frozen=True, kw_only=True):
     system: str
     domain_id: int
     discovery_range: DiscoveryRange
-    machines: tuple[CapturedMachine, ...]
     nodes: tuple[CapturedNode, ...]
     partial: bool
     gaps: tuple[str, ...]
@@ -182,13 +171,14 @@ def capture(
             endpoints[name].append(endpoint)
         elif not name or name not in nodes:
             unknown.append(endpoint)
-    machines = _machines(configurations, chosen)
-    machines = machines if len(machines) > 1 else ()
     instances = _instances(chosen, programs or {})
     keys = _keys(each.name for each in instances)
     apart = {each.node.full_name for each in instances if each.prefixes}
     shared = _shared(instances, keys)
     gaps = [unsettled] if unsettled else []
+    ours = [configurations[name] for name in chosen if name in configurations]
+    if len({each.identity.machine_id for each in ours}) > 1:
+        gaps.append("nodes are on several machines: declare these, and the `machine` of each node")
     gaps += [f"node {name} is left out: {why}" for name, why in illegal.items() if why]
     gaps += [
         f"{node.count} nodes are named {name}; "
@@ -205,7 +195,6 @@ def capture(
         system=system,
         domain_id=domain_id,
         discovery_range=discovery_range,
-        machines=machines,
         nodes=tuple(
             _node(
                 each,
@@ -214,7 +203,6 @@ def capture(
                 configuration=(own := configurations.get(each.node.full_name)),
                 parameters=_parameters(parameters.get(each.node.full_name), own),
                 serves=each.node.full_name in parameters,
-                machines=machines,
                 process=shared.get(each.program.process_id, "") if each.program else "",
             )
             for each in instances
@@ -343,36 +331,6 @@ def _keys(nodes: Iterable[str]) -> dict[str, str]:
     return keys
 
 
-def _machines(
-    configurations: Mapping[str, NodeConfiguration], chosen: Iterable[str]
-) -> tuple[CapturedMachine, ...]:
-    addresses: dict[str, str] = {}
-    for name in chosen:
-        configuration = configurations.get(name)
-        if configuration is None:
-            continue
-        machine = configuration.identity.machine_id
-        addresses[machine] = addresses.get(machine) or _address(configuration)
-    return tuple(
-        CapturedMachine(name=f"machine_{index}", machine_id=machine, address=address)
-        for index, (machine, address) in enumerate(sorted(addresses.items()), start=1)
-    )
-
-
-def _address(configuration: NodeConfiguration) -> str:
-    """Return an address that others reach the node's machine at, as its subscriptions report."""
-    return next(
-        (
-            nfe.internet_address
-            for report in configuration.endpoints
-            for nfe in report.nfes or ()
-            if nfe.internet_protocol is InternetProtocol.IPV4
-            and not nfe.internet_address.startswith(("127.", "0."))
-        ),
-        "",
-    )
-
-
 def _parameters(
     answered: tuple[CapturedParameter, ...] | None, configuration: NodeConfiguration | None
 ) -> tuple[CapturedParameter, ...] | None:
@@ -397,7 +355,6 @@ def _node(
     configuration: NodeConfiguration | None,
     parameters: tuple[CapturedParameter, ...] | None,
     serves: bool,
-    machines: tuple[CapturedMachine, ...],
     process: str,
 ) -> CapturedNode:
     node = instance.node
@@ -446,14 +403,10 @@ def _node(
     gaps += [instance.gap] if instance.gap else []
     if unset := [each.name for each in parameters or () if not each.type]:
         gaps.append(f"parameters that are declared and not set: {', '.join(sorted(unset))}")
-    machine = configuration.identity.machine_id if configuration else ""
-    if machines and not configuration:
-        gaps.append("its machine is not known")
     return CapturedNode(
         key=key,
         name=name,
         namespace=namespace or "/",
-        machine=next((each.name for each in machines if each.machine_id == machine), ""),
         managed=bool(node.managed),
         state=state,
         endpoints=tuple(taken.values()),

@@ -188,7 +188,6 @@ def kept(keys: Mapping[str, Tree | None]) -> dict[str, Tree]:
 
 
 def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str, Tree]:
-    unknown = Noted(value={}, note="gap: its address is unknown")
     ends = {(each.kind, each.name) for node in system.nodes for each in node.endpoints}
     waiting = {
         name for kind, name in ends if not kind.offers and (kind.other_end, name) not in ends
@@ -209,10 +208,6 @@ def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str
         {
             "manifest_version": 1,
             "system": system.system,
-            "machines": {
-                each.name: {"address": each.address} if each.address else unknown
-                for each in system.machines
-            },
             "discovery": kept({"domain_id": system.domain_id, "range": discovery_range}),
             "policy": kept(policy),
             "nodes": {each.key: _node(each, references.get(each.key, "")) for each in system.nodes},
@@ -249,7 +244,6 @@ def _node(node: CapturedNode, reference: str) -> Tree:
             "run": _run(run) if run else {"attach": True},
             "process": run.process if run else "",
             "name": node.name if node.key != node.name or (run and run.names) else "",
-            "machine": node.machine,
             "namespace": "" if node.namespace == "/" else node.namespace,
             "managed": node.managed,
             "state": node.state if node.managed and not is_active else "",

@@ -9,14 +9,13 @@ version 0.2.0.
 
 from __future__ import annotations
 
-import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 
 import msgspec
 
-from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     DIAGNOSTICS_TOPIC,
     MANAGED_SERVICES,
@@ -25,7 +24,7 @@ from lifecycle.manifest.names import (
     free_name,
     supervisor_alive_topic,
 )
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.verify.tool_filter import GRAPH_TOPIC, supervisor_endpoints
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
@@ -66,23 +65,21 @@ class Enclave(msgspec.Struct, frozen=True, kw_only=True):
         path: `/teleop/camera`.
         profiles: of its nodes.
         processes: names of the plan's processes; empty for a supervisor's.
-        chosen: the manifest names it, by the variable or by `--enclave`; else it must be given.
     """
 
     path: str
     profiles: tuple[Profile, ...]
     processes: tuple[str, ...] = ()
-    chosen: bool = False
 
 
 def enclaves_of(plan: Plan) -> tuple[Enclave, ...]:
     """Return the enclaves that a system needs: of its processes, then of its supervisors.
 
-    A process whose environment or command line names an enclave keeps it; those that name the same
-    share its permissions.
+    A process whose environment names an enclave keeps it; those that name the same share its
+    permissions.
     """
     found: dict[str, Enclave] = {}
-    chosen = {each.name: _chosen(each) for each in plan.processes}
+    chosen = {each.name: dict(each.environment).get(OVERRIDE, "") for each in plan.processes}
     for process in plan.processes:
         path = chosen[process.name] or free_name(
             _path(plan.system, process.name), {*found, *chosen.values()}
@@ -93,7 +90,6 @@ def enclaves_of(plan: Plan) -> tuple[Enclave, ...]:
             path=path,
             profiles=(*(known.profiles if known else ()), *profiles),
             processes=(*(known.processes if known else ()), process.name),
-            chosen=bool(chosen[process.name]),
         )
     for machine in plan.machines:
         # A process may be named as a supervisor's enclave is.
@@ -137,8 +133,8 @@ def _node_profile(node: PlannedNode) -> Profile:
         (EndpointKind.SUBSCRIPTION, "/clock"),
     }
     if node.managed:
-        allowed.add((EndpointKind.PUBLISHER, f"{node.full_name}/transition_event"))
         allowed |= {
+            (EndpointKind.PUBLISHER, f"{node.full_name}/transition_event"),
             (EndpointKind.PUBLISHER, GRAPH_TOPIC),
             (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
         }
@@ -170,17 +166,6 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
     several = len({each.machine for each in plan.nodes}) > 1
     allowed |= supervisor_endpoints(plan, machine if several else "")
     return Profile(namespace="/", name="_lifecycle_observer", allowed=frozenset(allowed))
-
-
-def _chosen(process: PlannedProcess) -> str:
-    """Return the enclave that a process is given by its manifest; empty if by none."""
-    if path := dict(process.environment).get(OVERRIDE, ""):
-        return path
-    words = process.argv if process.run.kind is RunKind.COMMAND else ()
-    for word, following in itertools.pairwise(words):
-        if word in {"--enclave", "-e"} and following.startswith("/"):
-            return following
-    return ""
 
 
 def _path(system: str, name: str) -> str:

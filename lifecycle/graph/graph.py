@@ -11,7 +11,6 @@ import asyncio
 import functools
 import logging
 import os
-import threading
 import typing
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
 from typing import Any, TypeVar
@@ -52,9 +51,6 @@ _T = TypeVar("_T")
 
 _QUIET_S, _BURST_S = 0.005, 0.05
 """A burst of changes is over when nothing changed for so long, and is cut off after so long."""
-
-FORGET_AFTER_S = 600.0
-"""A node that was silent for so long has left."""
 
 _ASK_S = 1.0
 """A node that answers at all answers within milliseconds."""
@@ -305,24 +301,6 @@ class Graph:
         """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`."""
         return verify(plan, self.observation(plan), stage=stage)
 
-    def wait_for(self, holds: Callable[[GraphState], object], *, timeout_s: float) -> bool:
-        """Wait until something holds of the state; False if it did not within `timeout_s`.
-
-        It is looked at after each change. Not to be called in a callback.
-        """
-        found = threading.Event()
-
-        def look(*_: object) -> None:
-            if not found.is_set() and holds(self.state):
-                found.set()
-
-        remove = self.state.on_change(look)
-        try:
-            self._loop.post(look)
-            return found.wait(timeout_s)
-        finally:
-            remove()
-
     def close(self) -> None:
         """Leave the graph; again is harmless. Nothing is called back after it."""
         if self._closed:
@@ -423,8 +401,6 @@ class Graph:
     def _state_changed(self, change: GraphChange) -> None:
         """Look again at a node that says something else of itself than it answered, or reports."""
         name, after = change.node, change.after
-        if after is not None and after.silent:
-            self._loop.loop.call_later(FORGET_AFTER_S, self.state.forget, after)
         if change.status_changed and name not in self.state.given:
             status = None if after is None else after.status
             if self._follows or not _says_as_before(status, self._answered.get(name)):

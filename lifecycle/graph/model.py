@@ -6,8 +6,9 @@ Pure.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
 
@@ -50,11 +51,6 @@ class NodeView(msgspec.Struct, frozen=True, kw_only=True):
         return None if said is None else said.connected
 
     @property
-    def instance(self) -> str:
-        """Which instance of the node it is; empty if it sends no statuses."""
-        return "" if self.status is None else self.status.instance
-
-    @property
     def endpoints(self) -> tuple[EndpointReport, ...]:
         """Its endpoints; none while its configuration is not known."""
         return () if self.configuration is None else self.configuration.endpoints
@@ -63,18 +59,6 @@ class NodeView(msgspec.Struct, frozen=True, kw_only=True):
     def connections(self) -> tuple[ConnectionReport, ...]:
         """Its connections; none while its configuration is not known."""
         return () if self.configuration is None else self.configuration.connections
-
-
-class EndpointChange(msgspec.Struct, frozen=True, kw_only=True):
-    """What is different about one node's endpoints; the new report for those that changed."""
-
-    added: tuple[EndpointReport, ...] = ()
-    removed: tuple[EndpointReport, ...] = ()
-    changed: tuple[EndpointReport, ...] = ()
-
-    def __bool__(self) -> bool:
-        """Whether anything is different."""
-        return bool(self.added or self.removed or self.changed)
 
 
 class GraphChange(msgspec.Struct, frozen=True, kw_only=True):
@@ -103,18 +87,15 @@ class GraphChange(msgspec.Struct, frozen=True, kw_only=True):
         before, after = (view and view.status for view in (self.before, self.after))
         return before != after
 
-    @property
-    def endpoints(self) -> EndpointChange:
-        """What became of its endpoints."""
+    def endpoints(self) -> Iterator[tuple[EndpointReport | None, EndpointReport | None]]:
+        """Yield each endpoint that is different, as it was and as it is; None: it was, is not."""
         before, after = (view.endpoints if view else () for view in (self.before, self.after))
         if before == after:
-            return EndpointChange()
+            return
         old, new = _by_key(before), _by_key(after)
-        return EndpointChange(
-            added=tuple(each for key, each in new.items() if key not in old),
-            removed=tuple(each for key, each in old.items() if key not in new),
-            changed=tuple(each for key, each in new.items() if key in old and old[key] != each),
-        )
+        for key in {**old, **new}:
+            if old.get(key) != new.get(key):
+                yield old.get(key), new.get(key)
 
 
 _Key = tuple[EndpointKind, str, str, str]
@@ -159,45 +140,38 @@ class Link(msgspec.Struct, frozen=True, kw_only=True):
     transport: str
     flows: tuple[FlowTuple, ...] = ()
 
-    @property
-    def connections(self) -> tuple[str, str]:
-        """Names of the publisher's and the subscription's connection; empty: own participant."""
-        return self.publisher.endpoint.connection, self.subscription.endpoint.connection
 
-
-def link(
-    topic: str,
-    publisher: End,
-    subscription: End,
-    *,
-    publishers: Sequence[SeenEndpoint],
-    subscriptions: Sequence[SeenEndpoint],
-) -> Link:
-    """Judge a pair of a topic, of which `match_ends` has all publishers and subscriptions."""
-    nfes = publisher.endpoint.nfes or (), subscription.endpoint.nfes or ()
-    transport = carrier(*nfes, _identity(publisher), _identity(subscription))
-    source, destination = _match_end(publisher), _match_end(subscription)
-    connected = Outcome.VIOLATED
-    reason = _missing(publisher) or _missing(subscription) or obstacle(source, destination)
-    if not reason and transport == NONE:
-        reason = "they have no transport in common"
-    if not reason:
-        connected, reason = match(source, destination, publishers, subscriptions) or (
-            Outcome.UNVERIFIABLE,
-            "neither end reports whom it is matched with",
+def links(topic: str, publishers: Sequence[End], subscriptions: Sequence[End]) -> Iterator[Link]:
+    """Judge each pair of all publishers and subscriptions of a topic."""
+    ends = {id(each): _seen(each) for each in (*publishers, *subscriptions)}
+    # DDS forgets a silent one in time.
+    sources = [ends[id(each)] for each in publishers if not each.node.silent]
+    targets = [ends[id(each)] for each in subscriptions if not each.node.silent]
+    for one, other in itertools.product(publishers, subscriptions):
+        nfes = one.endpoint.nfes or (), other.endpoint.nfes or ()
+        transport = carrier(*nfes, _identity(one), _identity(other))
+        source, target = ends[id(one)], ends[id(other)]
+        connected = Outcome.VIOLATED
+        reason = _missing(one) or _missing(other) or obstacle(source, target)
+        if not reason and transport == NONE:
+            reason = "they have no transport in common"
+        if not reason:
+            connected, reason = match(source, target, sources, targets) or (
+                Outcome.UNVERIFIABLE,
+                "neither end reports whom it is matched with",
+            )
+        yield Link(
+            topic=topic,
+            publisher=one,
+            subscription=other,
+            connected=connected,
+            reason=reason,
+            transport=transport,
+            flows=flow_tuples(*nfes) if transport in NETWORK_MEDIA else (),
         )
-    return Link(
-        topic=topic,
-        publisher=publisher,
-        subscription=subscription,
-        connected=connected,
-        reason=reason,
-        transport=transport,
-        flows=flow_tuples(*nfes) if transport in NETWORK_MEDIA else (),
-    )
 
 
-def _match_end(end: End) -> SeenEndpoint:
+def _seen(end: End) -> SeenEndpoint:
     """Return an end as the rules of matching take it; the state holds no tools."""
     endpoint = end.endpoint
     return SeenEndpoint(
@@ -208,11 +182,6 @@ def _match_end(end: End) -> SeenEndpoint:
         qos=endpoint.qos,
         report=endpoint,
     )
-
-
-def match_ends(ends: Sequence[End]) -> tuple[SeenEndpoint, ...]:
-    """Return the ends that can be matched; DDS forgets a silent one in time."""
-    return tuple(_match_end(each) for each in ends if not each.node.silent)
 
 
 def _missing(end: End) -> str:
@@ -227,7 +196,5 @@ def _missing(end: End) -> str:
 
 
 def _identity(end: End) -> Identity | None:
-    configuration = end.node.configuration
-    if configuration is None or not configuration.identity.machine_id:
-        return None
-    return configuration.identity
+    said = end.node.configuration
+    return said.identity if said is not None and said.identity.machine_id else None

@@ -206,15 +206,14 @@ class _Node:
 Diagnostic = tuple[str, int, str]
 """Name, level and message of a diagnostic_msgs/DiagnosticStatus."""
 
-_OF_WARN, _OF_ERROR, _OF_STALE = 1, 2, 3
-"""Levels of that."""
+_OF_ERROR = 2
+"""Level of that; below are OK and WARN, above is STALE."""
 
 STALE_S = 5.0
 """An entry that was not published for so long says nothing any more, as diagnostic_aggregator has
 it by default."""
 
 _LONGEST_MESSAGE = 200
-_MOST_ENTRIES = 1000
 
 
 class DiagnosticReadings:
@@ -265,8 +264,7 @@ class DiagnosticReadings:
         with self._lock:
             wanted = {each for patterns in self._patterns.values() for each in patterns}
             for name, level, message in entries:
-                known = name in self._entries or len(self._entries) < _MOST_ENTRIES
-                if known and any(matches(name, each) for each in wanted):
+                if any(matches(name, each) for each in wanted):
                     self._entries[name] = level, message[:_LONGEST_MESSAGE], self._clock()
             changed = self._reports() != self._said
         if changed:
@@ -284,12 +282,10 @@ class DiagnosticReadings:
             said = f": {message}" if message else ""
             if self._clock() - at_s > STALE_S:
                 unknown.append(f"{name!r} was not published for {STALE_S:g} s")
-            elif level == _OF_STALE:
-                unknown.append(f"{name!r} is stale{said}")
             elif level == _OF_ERROR:
                 wrong.append(f"{name!r}{said or ' has level ERROR'}")
-            elif level > _OF_WARN:
-                unknown.append(f"{name!r} has level {level}, which has no meaning{said}")
+            elif level > _OF_ERROR:
+                unknown.append(f"{name!r} is stale{said}")
             else:
                 ok = True
         if wrong or unknown:

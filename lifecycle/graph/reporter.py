@@ -21,11 +21,11 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from lifecycle.graph.status import (
-    MappingStatus,
     NodeStatus,
     NodeStatusError,
     decode,
     encode,
+    mappings_of,
     new_instance,
 )
 from lifecycle.middleware.rcl.conversions import latched
@@ -84,15 +84,7 @@ class GraphReporter:
         self.report(
             checksum=configuration.checksum,
             connections=configuration.connections,
-            mappings=tuple(
-                MappingStatus(
-                    endpoint=each.kind.spell(each.name or each.resolved),
-                    connection=each.connection,
-                    matched=each.matched,
-                )
-                for each in configuration.endpoints
-                if each.mapped
-            ),
+            mappings=mappings_of(configuration),
         )
 
     def left(self, reason: str = "") -> None:

@@ -23,8 +23,8 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.graph.model import End, GraphChange, Link, NodeView, link, match_ends
-from lifecycle.graph.status import MappingStatus, NodeStatus
+from lifecycle.graph.model import End, GraphChange, Link, NodeView, links
+from lifecycle.graph.status import MappingStatus, NodeStatus, mappings_of
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.measure.sample import Measured
 from lifecycle.verify.observation import (
@@ -91,31 +91,9 @@ class GraphState:
             if each.kind is kind and each.resolved == name
         )
 
-    def topics(self) -> tuple[str, ...]:
-        """Return every topic that is published or subscribed to, sorted."""
-        endpoints = (each for view in self.nodes() for each in view.endpoints)
-        return tuple(sorted({each.resolved for each in endpoints if each.kind.is_topic}))
-
-    def connected(self, topic: str, publisher: str, subscription: str) -> tuple[Link, ...]:
-        """Return how two nodes (full names) are connected by a topic, by pairs of endpoints."""
-        return tuple(
-            each
-            for each in self.flows(topic)
-            if (each.publisher.node.name, each.subscription.node.name) == (publisher, subscription)
-        )
-
-    def flows(self, topic: str | None = None) -> tuple[Link, ...]:
-        """Return every publisher → subscription pair, connected or not, of one topic or of all."""
-        found: list[Link] = []
-        for name in self.topics() if topic is None else (topic,):
-            publishers, subscriptions = self.publishers_of(name), self.subscriptions_of(name)
-            publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
-            found += [
-                link(name, one, other, publishers=publishing, subscriptions=subscribing)
-                for one in publishers
-                for other in subscriptions
-            ]
-        return tuple(found)
+    def flows(self, topic: str) -> tuple[Link, ...]:
+        """Return each pair of ends of a topic, connected or not, and by which flow."""
+        return tuple(links(topic, self.publishers_of(topic), self.subscriptions_of(topic)))
 
     # -- changes
 
@@ -208,12 +186,6 @@ class GraphState:
             else:
                 self._set(node, silent=reason)
 
-    def forget(self, view: NodeView) -> None:
-        """Take out a silent node of which nothing came since it was `view`."""
-        with self._lock:
-            if self._views.get(view.name) == view:
-                self._leave(view.name, "silent for long")
-
     def close(self) -> None:
         """Call nobody back any more; what is known stays as it is. Again is harmless."""
         with self._lock:
@@ -287,8 +259,6 @@ class GraphState:
             measured=measured,
         )
 
-
-_logger = logging.getLogger(__name__)
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")
@@ -423,22 +393,42 @@ def events_of(change: GraphChange) -> Iterator[GraphEvent]:
     yield from _endpoint_events(change)
 
 
+def connection_events(before: NodeConfiguration, after: NodeConfiguration) -> Iterator[GraphEvent]:
+    """Yield what became of a node's connections and mappings between two configurations."""
+    were, are = (
+        NodeStatus(
+            node=each.name, instance="", connections=each.connections, mappings=mappings_of(each)
+        )
+        for each in (before, after)
+    )
+    yield from _status_events(were, are, NodeView(name=after.name, status=are, configuration=after))
+
+
 def _status_events(before: NodeStatus, after: NodeStatus, view: NodeView) -> Iterator[GraphEvent]:
     """Yield the difference between two statuses of one instance."""
     if (before.state, before.connected) != (after.state, after.connected):
         yield GraphEvent(kind=EventKind.STATE_CHANGED, view=view)
+    mappings = tuple(
+        _differences(
+            {(each.endpoint, each.connection): each for each in before.mappings},
+            {(each.endpoint, each.connection): each for each in after.mappings},
+            lambda each: -1 if each is None else each.matched or 0,
+        )
+    )
+    losing = {mapping.connection for more, mapping in mappings if not more}
     for more, connection in _differences(
         {each.name: each for each in before.connections},
         {each.name: each for each in after.connections},
         lambda each: int(each is not None and each.established),
     ):
-        kind = EventKind.CONNECTION_ESTABLISHED if more else EventKind.CONNECTION_LOST
+        if more:
+            kind = EventKind.CONNECTION_ESTABLISHED
+        elif connection.established or connection.error or connection.name in losing:
+            kind = EventKind.CONNECTION_LOST
+        else:
+            continue  # what is mapped onto it and has no peer yet is no loss
         yield GraphEvent(kind=kind, view=view, connection=connection)
-    for more, mapping in _differences(
-        {(each.endpoint, each.connection): each for each in before.mappings},
-        {(each.endpoint, each.connection): each for each in after.mappings},
-        lambda each: -1 if each is None else each.matched or 0,
-    ):
+    for more, mapping in mappings:
         kind = EventKind.MAPPING_ESTABLISHED if more else EventKind.MAPPING_LOST
         yield GraphEvent(kind=kind, view=view, mapping=mapping)
     if before.checksum != after.checksum:
@@ -456,12 +446,10 @@ def _differences(
 
 
 def _endpoint_events(change: GraphChange) -> Iterator[GraphEvent]:
-    view, endpoints = change.after or change.before, change.endpoints
+    view = change.after or change.before
     assert view is not None
-    for kind, changed in (
-        (EventKind.ENDPOINT_REMOVED, endpoints.removed),
-        (EventKind.ENDPOINT_ADDED, endpoints.added),
-        (EventKind.ENDPOINT_CHANGED, endpoints.changed),
-    ):
-        for each in changed:
-            yield GraphEvent(kind=kind, view=view, endpoint=each)
+    for before, after in change.endpoints():
+        kind = EventKind.ENDPOINT_CHANGED
+        if before is None or after is None:
+            kind = EventKind.ENDPOINT_ADDED if before is None else EventKind.ENDPOINT_REMOVED
+        yield GraphEvent(kind=kind, view=view, endpoint=after or before)

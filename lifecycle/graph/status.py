@@ -15,6 +15,7 @@ import msgspec
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
+from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
 
 LONGEST_STATUS_BYTES = 1 << 20
@@ -38,6 +39,19 @@ class MappingStatus(msgspec.Struct, frozen=True, kw_only=True):
     endpoint: str
     connection: str = ""
     matched: codec.Count | None = None
+
+
+def mappings_of(configuration: NodeConfiguration) -> tuple[MappingStatus, ...]:
+    """Return what a configuration says of mappings."""
+    return tuple(
+        MappingStatus(
+            endpoint=each.kind.spell(each.name or each.resolved),
+            connection=each.connection,
+            matched=each.matched,
+        )
+        for each in configuration.endpoints
+        if each.mapped
+    )
 
 
 class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):

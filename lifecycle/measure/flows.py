@@ -1,9 +1,9 @@
 """Declared numbers of flows: whether each is kept once a sample can decide, and how it is shown.
 
-A delay needs 200 messages or 5 s, a loss 10 / bound messages, a rate 2 s and 20 periods. Until then
-nothing is said of it, as a canary analysis says nothing before its first interval is over. Where
-few messages decide, more of them must be late or lost than chance explains. Loads no plan and no
-rule: `lifecycle status` shows what was measured. Pure.
+A delay needs 200 messages or 5 s, a loss 10 / bound messages, a rate 2 s and 20 periods, a maximum
+alone 7 s at most. Until then nothing is said of it, as a canary analysis says nothing before its
+first interval is over. Where few messages decide, more of them must be late or lost than chance
+explains. Loads no plan and no rule: `lifecycle status` shows what was measured. Pure.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ from lifecycle.printable import count
 
 RATE_S = 2.0
 RATE_PERIODS = 20
+MAXIMUM_S = 7.0
+"""That data arrive rarely is seen after so long, within the probation of a system."""
+
 LOSS_EVENTS = 10
 """A share is known once so many losses would have been seen at the bound."""
 
@@ -167,31 +170,48 @@ def too_many(messages: int, share: float) -> int:
 
 
 def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
-    slowest = bound.least if bound.least is not None else bound.most
-    assert slowest is not None
-    needed_s = max(RATE_S, RATE_PERIODS / slowest)
+    least, most = bound.least, bound.most
+    if least is not None:
+        limit, needed_s = least, max(RATE_S, RATE_PERIODS / least)
+    else:
+        assert most is not None
+        limit, needed_s = most, min(max(RATE_S, RATE_PERIODS / most), MAXIMUM_S)
     seen = sample.last(seconds=needed_s)
-    new = publishes_s is not None and publishes_s < seen.seconds + REPORTED_S
-    decided = seen.seconds >= needed_s and not new
-    least = 0.0 if bound.least is None else bound.least * (1 - bound.slack)
+    left_s = max(needed_s - seen.seconds, REPORTED_S)
+    decided = seen.seconds >= needed_s
+    # It may have begun within the time that is seen, which is a little longer than what is needed.
+    published_s = REPORTED_S + (needed_s if least is None else seen.seconds)
+    if publishes_s is not None and publishes_s < published_s:
+        left_s, decided = max(left_s, needed_s + REPORTED_S - publishes_s), False
     # Where a slot begins and ends makes a difference of one message.
-    low = seen.messages + 1 < least * seen.seconds
-    high = bound.most is not None and seen.messages - 1 > bound.most * seen.seconds
-    limit = slowest
-    if bound.most is not None and (high or bound.least is None):
-        limit = bound.most
-        allowed = _limit("≤", ">", not high, f"{bound.most:g} Hz")
+    low = least is not None and seen.messages + 1 < least * (1 - bound.slack) * seen.seconds
+    high = None if most is None else _exceeding(most, sample)
+    if high is not None:
+        decided, seen = True, high
+    if most is not None and (high is not None or least is None):
+        limit = most
+        allowed = _limit("≤", ">", high is None, f"{most:g} Hz")
     else:
         slack = f" - {bound.slack:.0%}" if bound.slack else ""
-        allowed = _limit("≥", "<", not low, f"{bound.least:g} Hz{slack}")
-    left_s = max(needed_s - seen.seconds, REPORTED_S) + (needed_s if new else 0.0)
+        allowed = _limit("≥", "<", not low, f"{least:g} Hz{slack}")
     return Judgement(
-        kept=not (low or high) if decided else None,
+        kept=not (low or high is not None) if decided else None,
         observed=f"{seen.rate_hz:.1f} Hz" if seen.seconds else "",
         allowed=allowed,
         share=seen.rate_hz / limit if seen.seconds else None,
         decides_in_s=None if decided else left_s,
     )
+
+
+def _exceeding(most: float, sample: Sample) -> Slot | None:
+    """Return a recent past with more messages than a rate allows, whatever else arrives in it."""
+    periods_s = max(RATE_S, RATE_PERIODS / most)
+    # Of fewer than 20 periods one message more may be late, and be in it.
+    for needed_s, spare in ((periods_s, 1), (min(periods_s, MAXIMUM_S), 2)):
+        seen = sample.last(seconds=needed_s)
+        if seen.seconds >= RATE_S and seen.messages - spare > most * max(seen.seconds, needed_s):
+            return seen
+    return None
 
 
 def _loss(bound: Bound, sample: Sample) -> Judgement:

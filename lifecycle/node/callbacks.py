@@ -95,20 +95,19 @@ class Running:
                 self.awaits = True
                 yield yielded
 
-    def interrupt(self, error: LifecycleError) -> bool:
-        """Raise an error where it awaits; false if it is the one that asks, which goes on."""
+    def interrupt(self, error: LifecycleError) -> None:
+        """Raise an error where it awaits; if it is the one that asks it goes on."""
         if self._thread == threading.get_ident():
-            return False
+            return
         self.interruption = error
         if not self._lock.acquire(blocking=False):
-            return True  # at work in another thread, it is stopped at its next await
+            return  # at work in another thread, it is stopped at its next await
         self._thread = threading.get_ident()
         try:
             self._stop(error)
         finally:
             self._thread = 0
             self._lock.release()
-        return True
 
     def _step(self) -> Any:
         """Run it until it awaits; return what it yields."""
@@ -313,113 +312,70 @@ def _report(answer: object) -> HealthReport:
     return HealthReport(ok=False, message=said[:_LONGEST])
 
 
-class GoalInterruptedError(LifecycleError):
-    """Raised in the handler of an action where it awaits: its goal cannot be worked on any longer.
-
-    A handler may catch it to leave things as they should be, and may still set its goal's final
-    state and return a result; it must not await anything any more.
-    """
-
-
 class Goals:
-    """The goals of one action server, of which `fault` is what its handler raised last."""
+    """The goals of one action server: taken while its node is active, aborted when it is not."""
 
     def __init__(self, managed: Managed, endpoint: Endpoint) -> None:
-        assert endpoint.handler is not None
         self._managed = managed
-        self._node = managed.full_name
-        self._endpoint = endpoint
-        self._what = f"action server {endpoint.name!r} of {self._node}"
         self._log = managed.log
-        self._handler = endpoint.handler
-        self._accept = getattr(endpoint.handler, "accept", None)
-        self._gate = managed.gate
-        self._runs: dict[bytes, Running] = {}
+        self._endpoint = endpoint
+        self._what = f"a goal of action server {endpoint.name!r} of {managed.full_name}"
+        self._working: set[bytes] = set()
         self.server: GoalServer | None = None  # set by its maker, before it can have a goal
 
-    def end(self) -> None:
-        """Take every goal from its handler, and answer those that wait for its result.
+    def open(self) -> None:
+        """Goals are accepted from now on."""
 
-        A handler that causes this by what it does itself is left alone: it can still return.
-        """
-        reason = f"{self._node} is no longer active"
-        if self._gate.is_open:
-            reason = "it was taken off where it was mapped"
-        if self.server is None:
-            return
-        for goal in self.server.goals:
-            key = bytes(goal.goal_id.uuid)
-            run = self._runs.get(key)
-            if run is None:
-                self.server.finish(goal, None)  # accepted, and not begun
-                continue
-            error = GoalInterruptedError(f"cannot go on with a goal of {self._what}: {reason}")
-            if not run.interrupt(error):
-                continue
-            result = None
-            if run.done:
-                del self._runs[key]
-                result = self._outcome(goal, run)
-            self.server.finish(goal, result)
+    def close(self) -> None:
+        """Abort every goal, and answer those that wait for its result."""
+        self._working.clear()
+        if self.server is not None:
+            self.server.finish_all()
 
     async def accept(self, goal: Any) -> bool:
         """Decide on a goal: never unless active, and as the author's method says."""
-        if self._gate.is_open and self._accept is not None:
+        gate = self._managed.gate
+        decide = getattr(self._endpoint.handler, "accept", None)
+        if gate.is_open and decide is not None:
             try:
-                answer = await called(self._accept, goal)
+                if not await called(decide, goal):
+                    return False
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
                 self._log.error(traceback.format_exc())
-                self._log.error(
-                    f"cannot decide on a goal of {self._what}, so it is rejected: "
-                    f"{error_text(error)}"
-                )
+                self._log.error(f"cannot accept {self._what}: {error_text(error)}")
                 return False
-            if not isinstance(answer, bool):
-                self._log.error(
-                    f"cannot use {answer!r} as a decision on a goal of {self._what}, so "
-                    "it is rejected: return True or False"
-                )
-                return False
-            if not answer:
-                return False
-        if not self._gate.is_open:
-            self._log.warning(f"cannot accept a goal of {self._what}: it is not active")
-        return self._gate.is_open
+        if not gate.is_open:
+            self._log.warning(f"cannot accept {self._what}: it is not active")
+        return gate.is_open
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
         """Have the handler work on a goal; returns its result, None for an empty one."""
+        handler = self._endpoint.handler
+        assert handler is not None
         if not goal.is_active:
-            return None  # interrupted before it began
+            return None  # aborted before it began
         key = bytes(goal.goal_id.uuid)
-        run = self._runs[key] = Running(called(self._handler, goal))
+        self._working.add(key)
+        result, failure = None, None
         try:
-            await run
-        finally:
-            is_open = self._runs.pop(key, None) is not None
-        return self._outcome(goal, run) if is_open else None
-
-    def _outcome(self, goal: ServerGoalHandle, run: Running) -> Any | None:
-        """Say what is wrong with what a handler did; return the result, None for none."""
-        failure = run.failure
-        if run.interruption is not None and isinstance(failure, GoalInterruptedError):
-            return None
+            result = await called(handler, goal)
+            if not isinstance(result, (self._endpoint.interface.Result, type(None))):
+                raise TypeError(f"cannot send {result!r} as a result")  # noqa: TRY301
+        except Exception as error:  # noqa: BLE001 - the author's code: reported
+            result, failure = None, error
+            trace = traceback.format_exc()
+        if key not in self._working:
+            return None  # aborted meanwhile: whatever became of its handler
+        self._working.discard(key)
         if fault := self._managed.note_fault(self._endpoint, failure):
-            self._log.error(run.trace)
-            self._log.error(f"cannot go on with a goal of {self._what}: {fault}")
-            return None
-        returned = run.returned
-        if returned is not None and not isinstance(returned, self._endpoint.interface.Result):
+            self._log.error(trace)
+            self._log.error(f"cannot go on with {self._what}: {fault}")
+        elif goal.is_active:
             self._log.error(
-                f"cannot send {returned!r} as a result of {self._what}: return a "
-                f"{self._endpoint.interface.__name__}.Result, or None for an empty one"
+                f"cannot tell what {self._what} came to, so it is aborted: its handler returned "
+                "without succeed(), abort() or canceled()"
             )
-            return None
-        if goal.is_active and run.interruption is None:
-            self._log.error(
-                f"cannot tell what a goal of {self._what} came to, so it is aborted: its "
-                "handler returned without succeed(), abort() or canceled()"
-            )
-        return returned
+        return result
 
 
 def resolve_action_name(node: Node, name: str) -> str:

@@ -1,18 +1,15 @@
 """The connections of one node: extra participants that its endpoints can be mapped onto.
 
-`connect_to` of *Topological Discovery and Communication Negotiation*, and its introspection by
-notification: events are what is different in two configurations of a node.
+`connect_to` of *Topological Discovery and Communication Negotiation*.
 """
 
 from __future__ import annotations
 
 import contextlib
-import enum
 import functools
-import inspect
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,13 +18,9 @@ from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
-from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.node import Node
-
-    from lifecycle.node.configuration import ConfigurationChanges
-    from lifecycle.node.gate import Later
 
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -184,7 +177,7 @@ class Connections:
         if participant is not None:
             participant.destroy()
 
-    def close_unused(self, used: Collection[Connection | None]) -> None:
+    def close_unused(self, used: Collection[Connection]) -> None:
         """Unmake participants of single flows that carry nothing any more."""
         for each in tuple(self._made.values()):
             if not each.name and each not in used:
@@ -239,101 +232,3 @@ class Connections:
 def connections_of(urls: Iterable[ConnectionUrl | str]) -> ParticipantConnections:
     """Return what `connect_to(*urls)` asks for; a URL's text is kept as it was written."""
     return ParticipantConnections(urls=tuple(str(url) for url in urls))
-
-
-class ConnectionEventKind(enum.Enum):
-    """What happened."""
-
-    CONNECTION_ESTABLISHED = "connection_established"
-    CONNECTION_LOST = "connection_lost"
-    MAPPING_ESTABLISHED = "mapping_established"
-    MAPPING_LOST = "mapping_lost"
-
-
-class ConnectionEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing that became of a connection or of a mapping.
-
-    A connection is *established* when it was made, and again when every topic endpoint on it has a
-    matched peer after that was not so; *lost* when one has lost its last peer, or it was removed. A
-    mapping is *established* when it was made and with each peer that is matched, *lost* with each
-    peer that is no longer, and when it was removed.
-
-    Attributes:
-        connection: name; empty for the node's own participant.
-        urls: of the connection, as text.
-        endpoint: `publishers/video` for the two kinds of mapping events; else empty.
-        peers: matched endpoints after it; None for a mapping without a count (services, actions),
-            for connections, and for what was removed.
-        unmade: it was taken away on purpose: it does not exist any more.
-    """
-
-    kind: ConnectionEventKind
-    connection: str
-    urls: tuple[str, ...] = ()
-    endpoint: str = ""
-    peers: int | None = None
-    unmade: bool = False
-
-
-def events_between(
-    before: NodeConfiguration, after: NodeConfiguration
-) -> Iterator[ConnectionEvent]:
-    """Yield what became of connections and mappings.
-
-    What is mapped onto a connection and has no peer yet is no loss of it.
-    """
-    old = {each.name: each for each in before.connections if not each.error}
-    new = {each.name: each for each in after.connections if not each.error}
-    kinds = ConnectionEventKind
-
-    def event(kind: ConnectionEventKind, name: str, **fields: Any) -> ConnectionEvent:
-        urls = (old | new)[name].urls
-        return ConnectionEvent(kind=kind, connection=name, urls=urls, **fields)
-
-    for name in (each for each in new if each not in old):
-        yield event(kinds.CONNECTION_ESTABLISHED, name)
-    were, are = _mappings(before), _mappings(after)
-    for endpoint, name in (each for each in were if each not in are):
-        yield event(kinds.MAPPING_LOST, name, endpoint=endpoint, unmade=True)
-    losing = set()
-    for (endpoint, name), peers in are.items():
-        more = (peers or 0) - (were.get((endpoint, name)) or 0)
-        if more < 0:
-            losing.add(name)
-            yield event(kinds.MAPPING_LOST, name, endpoint=endpoint, peers=peers)
-        elif more > 0 or (endpoint, name) not in were:
-            yield event(kinds.MAPPING_ESTABLISHED, name, endpoint=endpoint, peers=peers)
-    for name in (each for each in new if each in old):
-        if new[name].established and not old[name].established:
-            yield event(kinds.CONNECTION_ESTABLISHED, name)
-        elif old[name].established and not new[name].established and name in losing:
-            yield event(kinds.CONNECTION_LOST, name)
-    for name in (each for each in old if each not in new):
-        yield event(kinds.CONNECTION_LOST, name, unmade=True)
-
-
-def _mappings(configuration: NodeConfiguration) -> dict[tuple[str, str], int | None]:
-    """Return the peers of each declared endpoint that is mapped, by its spelling and connection."""
-    return {
-        (each.kind.spell(each.name), each.connection): each.matched
-        for each in configuration.endpoints
-        if each.mapped and each.name
-    }
-
-
-def listen_to_connections(
-    changes: ConfigurationChanges, later: Later, listener: Callable[[ConnectionEvent], Any]
-) -> Callable[[], None]:
-    """Call `listener`, sync or async, with each event from now on; returns what ends that."""
-    before = changes.collect()
-
-    def look(after: NodeConfiguration) -> None:
-        nonlocal before
-        last, before = before, after
-        for event in events_between(last, after) if last is not None else ():
-            if inspect.iscoroutinefunction(listener):
-                later(functools.partial(listener, event))
-            else:
-                listener(event)
-
-    return changes.listen(look)

@@ -8,7 +8,6 @@ control channel: "Node Interface" of *Topological Discovery and Communication Ne
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +54,17 @@ _DECLARING = {
 
 _ACKNOWLEDGED = Duration(seconds=0.1)
 """How long a reliable publisher that is handed over is waited for; on one network a millisecond."""
+
+
+SETTLE_S = 0.25
+"""An old endpoint lives on after the new one has matched as many peers as it had: a match that is
+seen here does not prove that the other side has seen it."""
+
+PATIENCE_S = 4.0
+"""Both live at most so long, if the new one never matches as many.
+
+A participant that others have not noticed at once is announced again after 3 s.
+"""
 
 
 class NotConfiguredError(LifecycleError):
@@ -363,8 +373,8 @@ class DataLayer:
             )
         for endpoint in self.endpoints.values():
             handover = endpoint.handover
-            if handover is not None and found in (handover.old.connection, endpoint.connection):
-                handover.end()
+            if handover and handover.old and handover.old.connection is found:
+                self._end_handover(endpoint)
             if endpoint.connection is found:
                 self._unmap(endpoint)
         self.connections.close(found)
@@ -399,8 +409,7 @@ class DataLayer:
 
     def _unmap(self, endpoint: Endpoint) -> None:
         """Take an endpoint off where it is; harmless if it is nowhere."""
-        if endpoint.handover is not None:
-            endpoint.handover.end()
+        self._end_handover(endpoint)
         placement = endpoint.placement
         if placement is None:
             return
@@ -411,32 +420,41 @@ class DataLayer:
 
     def _move(self, endpoint: Endpoint, connection: Connection, *, at_once: bool = False) -> Future:
         """Make an endpoint on a connection, before it breaks where it was; done once it has."""
-        if endpoint.handover is not None:
-            endpoint.handover.end()
+        self._end_handover(endpoint)
         old, peers = endpoint.placement, _peers(endpoint)
-        endpoint.placement = self._place(endpoint, connection)
-        endpoint.error = ""
-
-        def finish() -> None:
-            endpoint.handover = None
-            if endpoint.handle is not None:
-                qos = endpoint.planned.qos
-                if old is not None and (qos is None or qos.reliability.name != "BEST_EFFORT"):
-                    old.entity.wait_for_all_acked(_ACKNOWLEDGED)
-                endpoint.handle.attach(endpoint.entity)
-            if old is not None:
-                self._unplace(endpoint, old)
-                self._tidy()
-            self._changed()
-
+        endpoint.placement, endpoint.error = self._place(endpoint, connection), ""
+        handover = endpoint.handover = Handover(old=old, peers=peers or 1)
         # Two servers would both answer; and a client's answers may still be under way.
         lives_on = peers > 0 if endpoint.kind.is_topic else endpoint.kind in CLIENTS
         if old is None or at_once or not lives_on or self._node.executor is None:
-            finish()
-            return _done()
-        endpoint.handover = handover = Handover(old, peers or 1, self._turns, finish)
-        handover.peers_changed(_peers(endpoint))
+            self._end_handover(endpoint)
+        else:
+            self._end_handover_in(PATIENCE_S, endpoint, handover)
+            self._matched(endpoint)
         return handover.done
+
+    def _end_handover_in(self, delay_s: float, endpoint: Endpoint, handover: Handover) -> None:
+        def end() -> None:
+            if endpoint.handover is handover:
+                self._end_handover(endpoint)
+
+        self._turns.call_after(delay_s, end)
+
+    def _end_handover(self, endpoint: Endpoint) -> None:
+        """Have an endpoint where it is mapped, and there alone; harmless if it is."""
+        handover, endpoint.handover = endpoint.handover, None
+        if handover is None:
+            return
+        old, qos = handover.old, endpoint.planned.qos
+        if endpoint.handle is not None:
+            if old is not None and (qos is None or qos.reliability.name != "BEST_EFFORT"):
+                old.entity.wait_for_all_acked(_ACKNOWLEDGED)
+            endpoint.handle.attach(endpoint.entity)
+        if old is not None:
+            self._unplace(endpoint, old)
+            self._tidy()
+        self._changed()
+        handover.done.set_result(None)
 
     def _place(self, endpoint: Endpoint, connection: Connection) -> Placement:
         """Make an endpoint on a connection; where it is now is left alone."""
@@ -448,8 +466,7 @@ class DataLayer:
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            changed = functools.partial(self._server_changed, entity)
-            unwatch = ServerWatch(connection.node or self._node, entity, changed).stop
+            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
         return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
@@ -459,20 +476,15 @@ class DataLayer:
 
     def _matched(self, endpoint: Endpoint) -> None:
         """Some entity of an endpoint has been matched or unmatched."""
-        if endpoint.handover is not None:
-            endpoint.handover.peers_changed(_peers(endpoint))
+        handover = endpoint.handover
+        if handover is not None and _peers(endpoint) >= handover.peers:
+            self._end_handover_in(SETTLE_S, endpoint, handover)
         self._changed()  # as many peers as before may be others
 
-    def _server_changed(self, client: Any) -> None:
-        """The server of a client was matched or unmatched; in a thread of the graph."""
-        if send_held := getattr(client, "send_held", None):
-            self._turns.call_soon(send_held)
-        self._changed()
-
     def _tidy(self) -> None:
-        used = [each.connection for each in self.endpoints.values()]
-        used += [each.handover.old.connection for each in self.endpoints.values() if each.handover]
-        self.connections.close_unused(used)
+        places = [each.placement for each in self.endpoints.values()]
+        places += [each.handover.old for each in self.endpoints.values() if each.handover]
+        self.connections.close_unused([each.connection for each in places if each])
 
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets."""

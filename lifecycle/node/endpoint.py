@@ -1,7 +1,7 @@
 """One endpoint of a node: what it is, how its rclpy entity is made, where it is, its handover.
 
 The factories of our own node are for what its author's code makes. What exists where is
-data_layer.py's. Blocking calls of what is made here raise where they would wait for ever.
+data_layer.py's.
 
 rclpy's matched events are handled in a group of the framework's: an author's callback that awaits
 something must not delay the event of a peer that appeared or left.
@@ -10,19 +10,16 @@ something must not delay the event of a peer that appeared or left.
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from rclpy.client import Client
 from rclpy.event_handler import (
     EventHandler,
     QoSPublisherEventType,
     QoSSubscriptionEventType,
     UnsupportedEventTypeError,
 )
-from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_system_default
@@ -45,7 +42,6 @@ if TYPE_CHECKING:
 
     from lifecycle.node.gate import DeclaredPublisher
     from lifecycle.node.managed import Managed
-    from lifecycle.node.services import Turns
 
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
@@ -242,53 +238,20 @@ def interface_name(interface: type[Any]) -> str:
     return f"{package}/{kind}/{interface.__name__}"
 
 
-SETTLE_S = 0.25
-"""The old one lives on after the new one has matched as many peers as it had."""
-
-PATIENCE_S = 4.0
-"""Both live at most so long, if the new one never matches as many.
-
-A participant that others have not noticed at once is announced again after 3 s.
-"""
-
-
-class Handover:
+class Handover(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The time in which an endpoint is on two connections: make before break.
 
-    Both ends of a flow learn of each other at different moments, so a match seen here does not
-    prove that the other side has seen it: the old one stays a little longer than that. Meanwhile a
-    publisher publishes by the old one, and a subscription receives by both.
+    Meanwhile a publisher publishes by the old one, and a subscription receives by both.
 
     Attributes:
-        old: where it is until then.
+        old: where it is until then; None if it was nowhere.
+        peers: how many the new one has to match.
         done: the old one is destroyed.
     """
 
-    def __init__(
-        self, old: Placement, peers_before: int, turns: Turns, finish: Callable[[], None]
-    ) -> None:
-        self.old = old
-        self.done: Future = Future()
-        self._peers_before = peers_before
-        self._turns = turns
-        self._finish = finish
-        self._settles = False
-        self._call_off = turns.call_after(PATIENCE_S, self.end)
-
-    def peers_changed(self, peers: int) -> None:
-        """The new one has so many peers now."""
-        if peers >= self._peers_before and not self._settles and not self.done.done():
-            self._settles = True
-            self._call_off()
-            self._call_off = self._turns.call_after(SETTLE_S, self.end)
-
-    def end(self) -> None:
-        """Break now; again is harmless."""
-        if self.done.done():
-            return
-        self._call_off()
-        self.done.set_result(None)
-        self._finish()
+    old: Placement | None
+    peers: int
+    done: Future = msgspec.field(default_factory=Future)
 
 
 _DESTROY = {
@@ -307,14 +270,6 @@ def make_entity(managed: Managed, endpoint: Endpoint, connection: Connection) ->
     if introspection is not None:
         entity.configure_introspection(
             managed.node.get_clock(), qos_profile_system_default, introspection
-        )
-    made = wire_name(entity)
-    if endpoint.given_name and made and made != endpoint.given_name:
-        unmake(managed, kind, entity, connection)
-        raise LifecycleError(
-            f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
-            f"rule that the node was started with makes it {made!r}",
-            hint="take the rule out of the manifest's `remap:`, or choose another name",
         )
     return entity
 
@@ -377,27 +332,25 @@ def _served_on(managed: Managed, endpoint: Endpoint, node: Node, *, name: str) -
     group = endpoint.options.get("callback_group") or own
     if kind.is_action:
         # Late: numpy, 100 ms.
-        from lifecycle.middleware.services.actions import GoalClient, GoalServer
+        from rclpy.action import ActionClient
+
+        from lifecycle.middleware.services.actions import GoalServer
 
         if kind is EndpointKind.ACTION_CLIENT:
-            return GoalClient(node, interface, name, group=group, refuse_to_block=refuse_to_block)
+            return ActionClient(node, interface, name, callback_group=group)
         goals = Goals(managed, endpoint)
         goals.server = GoalServer(
             node, interface, name, goals.execute, accept=goals.accept, group=group
         )
-        managed.gate.add_worker(goals.server, goals.end)
+        managed.gate.add(goals.server, goals)
         return goals.server
     options: dict[str, Any] = {"callback_group": group}
     if endpoint.planned.qos is not None:
         options["qos_profile"] = to_rclpy(endpoint.planned.qos)
     if kind is EndpointKind.SERVICE_CLIENT:
-        client = Node.create_client(node, interface, name, **options)
-        refuse_to_deadlock(client)
-        return client
+        return Node.create_client(node, interface, name, **options)
     assert endpoint.handler is not None
-    service = Node.create_service(node, interface, name, _answering(endpoint.handler), **options)
-    _survive_late_answers(managed, service, endpoint.name)
-    return service
+    return Node.create_service(node, interface, name, _answering(endpoint.handler), **options)
 
 
 def _name(managed: Managed, endpoint: Endpoint, connection: Connection) -> str:
@@ -405,24 +358,6 @@ def _name(managed: Managed, endpoint: Endpoint, connection: Connection) -> str:
     if endpoint.given_name or connection.participant is None:
         return endpoint.given_name or endpoint.name
     return resolve_name(managed.node, endpoint.kind, endpoint.name)
-
-
-def _survive_late_answers(managed: Managed, service: Any, name: str) -> None:
-    """Let an answer after its server was destroyed be lost, not end the process."""
-    send = service.send_response
-    warn = managed.log.warning
-
-    @functools.wraps(send)
-    def send_response(response: Any, header: Any) -> None:
-        try:
-            send(response, header)
-        except InvalidHandle:
-            warn(
-                f"cannot send the answer of service server {name!r}: it was "
-                "disconnected while its handler worked on it"
-            )
-
-    service.send_response = send_response
 
 
 def factory(planned: PlannedEndpoint, connection: Connection, node: Node) -> Callable[..., Any]:
@@ -453,42 +388,3 @@ def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:
         return response if returned is None else returned
 
     return answer
-
-
-_SPINNING = {
-    ("rclpy.executors", "spin_once"),
-    ("rclpy.executors", "spin_once_until_future_complete"),
-    ("lifecycle.node.host.loop", "turn"),
-    ("lifecycle.node.host.loop", "_spin"),
-}
-"""Where a single-threaded executor calls back: rclpy's, and those of our own processes."""
-
-
-class DeadlockError(LifecycleError):
-    """A blocking call was made in the thread that would have to bring its answer."""
-
-
-def refuse_to_deadlock(client: Client) -> None:
-    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
-    blocking = client.call
-
-    @functools.wraps(blocking)
-    def call(*arguments: Any, **options: Any) -> Any:
-        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
-        return blocking(*arguments, **options)
-
-    client.call = call
-
-
-def refuse_to_block(what: str, instead: str) -> None:
-    """Raise DeadlockError inside the executor, where waiting for `what` would never end."""
-    # A multi-threaded executor runs callbacks in other threads than the one that spins.
-    frame = inspect.currentframe()
-    while frame is not None:
-        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
-            raise DeadlockError(
-                f"cannot wait for {what} in a callback: the answer comes by the executor that "
-                "waits for this callback",
-                hint=f"write `async def` and `await {instead}`",
-            )
-        frame = frame.f_back

@@ -60,7 +60,6 @@ class NodeGate:
         self.is_open = False
         self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
-        self._workers: dict[int, Callable[[], None]] = {}
         self._left: dict[str, Counter] = {}  # of subscriptions that are gone, by topic
         self._opened_ns = 0
 
@@ -69,17 +68,13 @@ class NodeGate:
         self._entities[id(entity)] = gated
         (gated.open if self.is_open else gated.close)()
 
-    def add_worker(self, entity: object, stop: Callable[[], None]) -> None:
-        """Have `stop` called at removal, and before anything is closed: its last messages pass."""
-        self._workers[id(entity)] = stop
-
     def remove(self, entity: object) -> None:
-        """Forget an entity that is being destroyed."""
+        """Close and forget an entity that is being destroyed."""
         gone = self._entities.pop(id(entity), None)
         if isinstance(gone, GatedSubscription) and gone.counter is not None:
             self._left[gone.topic] = gone.counter
-        if (stop := self._workers.pop(id(entity), None)) is not None:
-            stop()
+        if gone is not None:
+            gone.close()
 
     def measure(self, apart: Collection[str]) -> None:
         """Count what arrives from now on; `apart`: what is published by another host's clock."""
@@ -121,8 +116,6 @@ class NodeGate:
         """Close every entity; the node is no longer active."""
         self.is_open = False
         self._left.clear()
-        for stop in tuple(self._workers.values()):
-            stop()
         for gated in tuple(self._entities.values()):
             gated.close()
 

@@ -94,22 +94,22 @@ def on_action(action: str) -> Callable[[F], F]:
         >>> class Base(LifecycleNode):
         ...     @on_action("dock")
         ...     async def dock(self, goal_handle):
-        ...         while self.distance() > 0.01:
+        ...         while goal_handle.is_active and self.distance() > 0.01:
         ...             if goal_handle.is_cancel_requested:
         ...                 goal_handle.canceled()
         ...                 return None
         ...             await self.sleep(0.1)
-        ...         goal_handle.succeed()
+        ...         if goal_handle.is_active:
+        ...             goal_handle.succeed()
         ...         return Dock.Result()
 
     Write it as `async def` unless it returns at once: a sync one keeps its node, and all nodes of
     its process, from everything else, so that no request to cancel gets through either. Several
     goals are executed at a time.
 
-    When the node leaves the active state, or the action is taken off its connection, what is being
-    executed ends: `GoalInterruptedError` is raised in an `async def` method where it awaits, its
-    goal is aborted unless the method says otherwise on its way out, and clients have their answer
-    before on_deactivate or on_shutdown runs. Publishers still publish meanwhile.
+    When the node leaves the active state, or the action is taken off its connection, its goals are
+    aborted, and clients have their answer before on_deactivate or on_shutdown runs. The method goes
+    on: it should return once `goal_handle.is_active` is false.
     """
     return _marker(_Mark(kind=EndpointKind.ACTION_SERVER, name=action))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -26,13 +28,8 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.connections import (
-    Connection,
-    ConnectionEvent,
-    connections_of,
-    listen_to_connections,
-)
-from lifecycle.node.endpoint import Placement, interface_name, refuse_to_deadlock, resolve_name
+from lifecycle.node.connections import Connection, connections_of
+from lifecycle.node.endpoint import Placement, interface_name, resolve_name
 from lifecycle.node.gate import (
     DeclaredPublisher,
     Gated,
@@ -52,12 +49,15 @@ from lifecycle.node.planned import (
     plan_without_manifest,
 )
 from lifecycle.plan.model import PlannedEndpoint
+from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
     from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
     from rclpy.service_introspection import ServiceIntrospectionState
+
+    from lifecycle.graph.state import GraphEvent
 
 
 __all__ = ["ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn"]
@@ -184,8 +184,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     def client(self, name: str) -> Client:
         """Return the declared service client `name`, from on_connect on.
 
-        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` raises
-        DeadlockError. Raises LifecycleError while the node is not connected.
+        In callbacks, `await self.client("reset").call_async(request)`: the blocking `call` waits
+        for the executor that waits for it. Raises LifecycleError while the node is not connected.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
 
@@ -205,7 +205,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """Return the declared action client `name`, from on_connect on; raises as `client`.
 
         In callbacks, `goal = await self.action_client("dock").send_goal_async(Dock.Goal())`, then
-        `await goal.get_result_async()`; the blocking calls raise DeadlockError.
+        `await goal.get_result_async()`; as with rclpy, a goal that no server is there for is lost.
         """
         return self.lifecycle.data_layer.entity(EndpointKind.ACTION_CLIENT, name)
 
@@ -510,15 +510,30 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             for each in self.lifecycle.data_layer.endpoints.values()
         )
 
-    def on_connection_event(self, callback: Callable[[ConnectionEvent], Any]) -> Callable[[], None]:
+    def on_connection_event(self, callback: Callable[[GraphEvent], Any]) -> Callable[[], None]:
         """Call back, sync or async, when a connection or mapping is established or lost.
+
+        `callback` gets what others are sent of this node on the graph topic.
 
         Returns:
             What ends it.
         """
+        # Late: most nodes have no use for it.
+        from lifecycle.graph.state import connection_events
+
         managed = self.lifecycle
-        changes, later = managed.configuration_changes, managed.turns.call_soon
-        return listen_to_connections(changes, later, callback)
+        before = managed.configuration_changes.collect()
+
+        def look(after: NodeConfiguration) -> None:
+            nonlocal before
+            for event in connection_events(before, after) if before is not None else ():
+                if inspect.iscoroutinefunction(callback):
+                    managed.turns.call_soon(functools.partial(callback, event))
+                else:
+                    callback(event)
+            before = after
+
+        return managed.configuration_changes.listen(look)
 
     # The factories of rclpy: what they make is gated.
 
@@ -571,7 +586,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         if options.get("callback_group") is None:
             options["callback_group"] = self.lifecycle.turns.group
         client = super().create_client(srv_type, srv_name, **options)
-        refuse_to_deadlock(client)
         self._gated(client, None, EndpointKind.SERVICE_CLIENT)
         return client
 

@@ -146,7 +146,8 @@ def build_plan(
         domain_id: 0–232, in the place of the manifest's; None leaves that.
 
     Raises:
-        PlanError: the manifest cannot be planned here, for example an executable is missing.
+        ManifestError: nothing can connect some of its endpoints.
+        PlanError: it cannot be planned here, for example an executable is missing.
         UsageError: ROS_DOMAIN_ID or ROS_AUTOMATIC_DISCOVERY_RANGE is needed and not legal.
     """
     variables = os.environ if environment is None else environment
@@ -245,10 +246,11 @@ def check_plan(
         _wired(manifest, variables, parameters)
     except UsageError:
         return ()  # the environment's fault, reported where it is used
+    except ManifestError as problem:
+        return problem.diagnostics
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
-        alone = error("plan.impossible", at, problem.message, problem.hint)
-        return problem.diagnostics or (alone,)
+        return (error("plan.impossible", at, problem.message, problem.hint),)
     return tuple(_without_clock(manifest, parameters))
 
 

@@ -21,38 +21,26 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
-    QUANTILE,
-    OnViolation,
+    NodeDeclaration,
     ParameterValue,
     Quantity,
     RunKind,
     Supervision,
+    SystemDeclaration,
     TargetState,
     Timeouts,
 )
 from lifecycle.plan.model import (
     ExpectedParameter,
     Plan,
-    PlannedEndpoint,
-    PlannedFile,
     PlannedNode,
+    declared,
     in_mode,
 )
 from lifecycle.plan.parameters import COMMAND
 from lifecycle.plan.processes import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
-
-_SYSTEM = ("system", "discovery", "network", "data_layer")
-
-_NODE = (
-    *("name", "namespace", "machine", "managed", "timeouts", "log_level", "state", "may_end"),
-    *("health", "process"),
-)
-"""Fields of a node that are in its document as they are; what is planned from them is in none."""
-
-_FLOW = ("unique", "dscp", "transport", "lossy", "measure")
-"""Fields of an endpoint that say what it asks of its flow, beside numbers; none by default."""
 
 
 class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,14 +63,13 @@ class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
 def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
     """Return every difference between what two plans declare, the system's first, then by node."""
     before, after = _document(old), _document(new)
-    places = _positions(new)
     return tuple(
         PlanDifference(
             path=".".join(path),
             node=path[1] if path[0] == "nodes" else "",
             old=was,
             new=now,
-            at=_at(path, places),
+            at=_at(path, new),
         )
         for path, was, now in sorted(
             _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
@@ -100,65 +87,90 @@ def plan_checksum(plan: Plan) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-_Tree = Mapping[str, object]
 _Path = tuple[str, ...]
 
 
-def _document(plan: Plan) -> _Tree:
+def _document(plan: Plan) -> dict[str, Any]:
     """Return what is declared, as mappings by the manifest's keys."""
-    document: dict[str, object] = {
-        **{name: to_plain(getattr(plan, name)) for name in _SYSTEM},
-        "machines": {each.name: {"address": each.address} for each in plan.machines},
-        "policy": {**_fields(plan.policy), "ros_interface": plan.policy.access.value},
-        "on_violation": _consequences(plan.on_violation),
-        "modes": {
-            each.name: {
-                "inactive": list(each.inactive),
-                "parameters": {
-                    f"{one.node}: {one.name}": to_plain(one.value) for one in each.parameters
-                },
-            }
-            for each in plan.modes
-        },
+    document: dict[str, Any] = {
+        **_tree(to_plain(declared(SystemDeclaration, plan))),
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
                 "unique": flow.unique.value,
                 "transport": flow.transport.value,
+                "measure": flow.measure,
                 **_numbers(flow.quantities),
-                **({"measure": True} if flow.measure else {}),
             }
             for flow in plan.flows
             if flow.linked
         },
         "nodes": {node.key: _node(node) for node in plan.nodes},
     }
+    document["policy"]["ros_interface"] = plan.policy.access.value
     if any(node.connections.urls for node in plan.nodes):
         document["order of nodes"] = [node.key for node in plan.nodes]
     return document
 
 
-def _node(node: PlannedNode) -> _Tree:
+_NOT_COMPARED = ("at", "positions", "unproven", "key", "description")
+_NAMES = ("rule", "kind", "node", "name")
+"""Fields that tell the entries of a list apart."""
+
+
+def _tree(value: Any) -> Any:
+    """Return a plain value without positions; of lists of what has a name, mappings by it."""
+    if isinstance(value, dict):
+        return {key: _tree(each) for key, each in value.items() if key not in _NOT_COMPARED}
+    if not isinstance(value, list | tuple):
+        return value
+    if value and all(isinstance(each, list | tuple) and len(each) == 2 for each in value):
+        return {str(key): _tree(each) for key, each in value}
+    if value and all(isinstance(each, dict) and "at" in each for each in value):
+        return {
+            ": ".join(str(each.pop(key)) for key in _NAMES if key in each): _tree(each)
+            for each in value
+        }
+    return [*map(_tree, value)]
+
+
+def _node(node: PlannedNode) -> dict[str, Any]:
     written = {each.place: each for each in node.files}
     files = [written.get(f"parameter_files.{index}") for index in range(len(node.parameter_files))]
+    document: dict[str, Any] = _tree(to_plain(declared(NodeDeclaration, node)))
+    interface: dict[str, dict[str, Any]] = {"parameters": _tree(to_plain(node.declared_parameters))}
+    flows: dict[str, dict[str, Any]] = {}
+    waiting = {each.name for each in node.participants if each.non_blocking_send}
+    for each in node.endpoints:
+        qos = _tree(to_plain(each.qos)) or {}
+        of = interface.setdefault(each.kind.value, {}), flows.setdefault(each.kind.value, {})
+        of[0][each.name] = {
+            "type": each.type,
+            "qos": {key: value for key, value in qos.items() if key not in each.qos_defaults},
+        }
+        of[1][each.name] = {
+            **{name: to_plain(getattr(each, name)) for name in _FLOW},
+            "five_qi": "auto" if each.five_qi_reason else None,
+            "non_blocking_send": each.participant in waiting,
+            **_numbers(each.quantities),
+        }
+    if folder := written.get("run.working_directory"):
+        document["run"]["working_directory"] = folder.written
     return {
-        **{name: to_plain(getattr(node, name)) for name in _NODE},
-        **_fields(node.supervision),
-        "endpoints": node.endpoint_policy.value,
+        **document,
+        **document.pop("supervision"),
         "interface.parameters": node.has_all_parameters,
-        "on_violation": _consequences(node.on_violation),
-        "run": _run(node, written.get("run.working_directory")),
-        "parameters": _plain(node.parameters),
+        "process": node.process,
+        "endpoints": node.endpoint_policy.value,
         "parameter_files": [
-            {"path": each.written, "contents": each.digest} if each else {"path": path}
+            f"{each.written} {each.digest}" if each else path
             for path, each in zip(node.parameter_files, files, strict=True)
         ],
-        "remap": dict(node.remap),
         "after": {
             key: " and ".join(str(each.condition) for each in group)
             for key, group in itertools.groupby(node.after, key=lambda each: each.node)
         },
-        "interface": _interface(node),
-        "flows": _flows(node),
+        "interface": interface,
+        "flows": flows,
         "connections": {
             each.connection: {
                 "urls": [*each.connections.urls],
@@ -174,82 +186,17 @@ def _node(node: PlannedNode) -> _Tree:
     }
 
 
-def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
-    run = node.run
-    return {
-        **{name: each for name, each in _fields(run, "kind").items() if each},
-        **{name: _plain(getattr(run, name)) for name in _OF_RUN if getattr(run, name)},
-        "working_directory": folder.written if folder else run.working_directory or None,
-    }
+_FLOW = ("unique", "dscp", "enforce_dscp", "transport", "lossy", "measure")
+"""Fields of an endpoint that say what it asks of its flow, beside numbers."""
 
 
-_OF_RUN = ("arguments", "environment", "extra_arguments")
-"""Fields of `run` that are pairs of a name and a value."""
-
-
-def _plain(values: Iterable[tuple[str, object]]) -> _Tree:
-    return {name: to_plain(value) for name, value in values}
-
-
-def _consequences(said: OnViolation) -> _Tree:
-    return {each.rule: f"{each.what.value} {each.mode}".rstrip() for each in said}
-
-
-def _interface(node: PlannedNode) -> _Tree:
-    found: dict[str, dict[str, object]] = {"parameters": {}}
-    for parameter in node.declared_parameters:
-        declared = _fields(parameter, "name", "description")
-        declared["default_value"] = declared.pop("default")
-        found["parameters"][parameter.name] = declared
-    for each in node.endpoints:
-        declared = {"type": each.type}
-        if each.qos is not None:
-            declared["qos"] = _fields(each.qos, *each.qos_defaults)
-        found.setdefault(each.kind.value, {})[each.name] = declared
-    return found
-
-
-def _flows(node: PlannedNode) -> _Tree:
-    """Return what each endpoint asks of its flow, without what it does not ask."""
-    found: dict[str, dict[str, object]] = {}
-    waiting = {each.name for each in node.participants if each.non_blocking_send}
-    for each in node.endpoints:
-        asked = {
-            name: to_plain(getattr(each, name))
-            for name in _FLOW
-            if getattr(each, name) != _NOT_ASKED[name]
-        }
-        asked.update(_numbers(each.quantities))
-        if each.five_qi_reason:  # proposed for what is declared
-            asked.pop("dscp", None)
-            asked["five_qi"] = "auto"
-        if not each.enforce_dscp:
-            asked["enforce"] = False
-        if each.participant in waiting:
-            asked["non_blocking_send"] = True
-        found.setdefault(each.kind.value, {})[each.name] = asked
-    return found
-
-
-def _numbers(quantities: Iterable[Quantity]) -> dict[str, object]:
-    """Return numbers by their keys; those of several links on one pair are a list."""
-    found: dict[str, list[object]] = {}
+def _numbers(quantities: Iterable[Quantity]) -> dict[str, str]:
+    """Return numbers by their keys, those of several links on one pair together."""
+    found: dict[str, str] = {}
     for each in quantities:
-        plain = each.value if each.most is None else str(each).removeprefix(f"{each.name} ")
-        found.setdefault(each.name, []).append(plain)
-        if each.quantile != QUANTILE:
-            found.setdefault("quantile", []).append(each.quantile)
-    return {name: each[0] if len(each) == 1 else each for name, each in found.items()}
-
-
-_NOT_ASKED = {each.name: each.default for each in msgspec.structs.fields(PlannedEndpoint)}
-
-
-def _fields(value: object, *without: str) -> dict[str, object]:
-    """Return the fields of a Struct by name, without where it is written."""
-    plain = _without_positions(to_plain(value))
-    assert isinstance(plain, dict)
-    return {name: each for name, each in plain.items() if name not in without}
+        before = f"{found[each.name]}, " if each.name in found else ""
+        found[each.name] = before + str(each).removeprefix(f"{each.name} ")
+    return found
 
 
 def _compared(path: _Path, old: object, new: object) -> Iterator[tuple[_Path, str, str]]:
@@ -277,20 +224,13 @@ def _shown(value: object, absent: str) -> str:
     return text if len(text) <= _VALUE_CHARACTERS else f"{text[: _VALUE_CHARACTERS - 1]}…"
 
 
-def _positions(plan: Plan) -> dict[_Path, Position]:
-    found: dict[_Path, Position] = {}
-    for node in plan.nodes:
-        found["nodes", node.key] = node.at
-        for each in node.endpoints:
-            found["nodes", node.key, "interface", each.kind.value, each.name] = each.at
-            found["nodes", node.key, "flows", each.kind.value, each.name] = each.at
-    return found
-
-
-def _at(path: _Path, places: Mapping[_Path, Position]) -> Position | None:
-    """Return the position of the innermost part of `path` that has one."""
-    inner = (path[:length] for length in range(len(path), 0, -1))
-    return next((places[each] for each in inner if each in places), None)
+def _at(path: _Path, plan: Plan) -> Position | None:
+    """Return the position of the endpoint, else the node, that a path leads to."""
+    for node in plan.nodes if path[0] == "nodes" else ():
+        if node.key == path[1]:
+            ends = (each.at for each in node.endpoints if path[3:5] == (each.kind.value, each.name))
+            return next(ends, node.at)
+    return None
 
 
 MAX_TEXT = 1 << 20
@@ -395,18 +335,6 @@ def difference_lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     return (*lines[:_MOST_LINES], *([f"and {more} more"] if more > 0 else []))
 
 
-_JUDGED_BY = (
-    *("enforce_dscp", "five_qi", "five_qi_reason", "max_delay_ms", "quantities"),
-    *("measure", "type_hash", "qos_defaults"),
-)
-"""Fields of an endpoint that its process does not know: they are for the verdict and networks."""
-
-_ENDPOINT: dict[str, Any] = {
-    each.name: each.default
-    for each in msgspec.structs.fields(PlannedEndpoint)
-    if each.name in _JUDGED_BY
-}
-
 _NOT_SET = ("array", "byte_array")
 """Types of which a value alone does not say how it is to be sent."""
 
@@ -485,10 +413,24 @@ def _as_run(node: PlannedNode) -> object:
     unmanaged = node.state is TargetState.UNCONFIGURED
     bare = replace(
         node,
-        endpoints=tuple(replace(each, **_ENDPOINT) for each in node.endpoints),
+        # What is for the verdict and for networks alone.
+        endpoints=tuple(
+            replace(
+                each,
+                enforce_dscp=True,
+                five_qi=None,
+                five_qi_reason="",
+                max_delay_ms=None,
+                quantities=(),
+                measure=False,
+                type_hash="",
+                qos_defaults=(),
+            )
+            for each in node.endpoints
+        ),
         participants=tuple(replace(each, reason="") for each in node.participants),
         parameters=(),
-        mode_parameters=(),
+        mode_parameters={},
         parameter_files=(),
         expected_parameters=(),
         unread_parameter_files=(),
@@ -501,13 +443,7 @@ def _as_run(node: PlannedNode) -> object:
         on_violation=(),
         timeouts=node.timeouts if hosted else Timeouts(),
     )
-    return _without_positions(to_plain(bare))
-
-
-def _without_positions(plain: object) -> object:
-    if isinstance(plain, dict):
-        return {key: _without_positions(each) for key, each in plain.items() if key != "at"}
-    return [*map(_without_positions, plain)] if isinstance(plain, list | tuple) else plain
+    return _tree(to_plain(bare))
 
 
 def _processes(plan: Plan) -> Mapping[str, object]:

@@ -8,6 +8,7 @@ Owns: the types that cross from here into verify/, middleware/, node/ and superv
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -15,7 +16,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
     SIM_TIME,
     Authority,
@@ -47,9 +48,6 @@ def declared(as_: type, by: object) -> dict[str, Any]:
     """
     return {each.name: getattr(by, each.name) for each in msgspec.structs.fields(as_)}
 
-
-MAX_USER_ID = 32767
-"""Fast DDS 2.14 reads ids of endpoints as int16_t."""
 
 GRAPH_TOPIC = "ros_discovery_info"
 """By which rmw maps endpoints to nodes; every participant has a writer and a reader of it."""
@@ -222,18 +220,6 @@ def raw_value(value: Any, type_: str) -> Any:
     return float(value.replace(".", "")) if isinstance(value, str) else value
 
 
-class ModeParameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What those parameters of a node are in one mode that some mode sets.
-
-    Attributes:
-        mode: its name.
-        parameters: where this mode says nothing of them, as they are given or declared.
-    """
-
-    mode: str
-    parameters: tuple[ExpectedParameter, ...]
-
-
 class HeldBy(enum.Enum):
     """What keeps a node from working before the gate opens."""
 
@@ -251,7 +237,7 @@ class PlannedNode(NodeDeclaration, frozen=True, kw_only=True):
         held_by: what holds it until the system is verified.
         expected_parameters: what its parameters must be once it is configured: those declared and
             those given, see lifecycle.plan.parameters.
-        mode_parameters: what of them modes change, for each mode; empty if none does.
+        mode_parameters: by mode, what those of them are that some mode changes.
         has_all_parameters: it may have no others than those, and those that ROS declares itself.
         unread_parameter_files: those whose values are not known here and so not expected.
         transports: all that the node's own participant may use, UDPV4, UDPV6; empty leaves it
@@ -277,15 +263,10 @@ class PlannedNode(NodeDeclaration, frozen=True, kw_only=True):
     membership: bool = False
     files: tuple[PlannedFile, ...] = ()
     expected_parameters: tuple[ExpectedParameter, ...] = ()
-    mode_parameters: tuple[ModeParameters, ...] = ()
+    mode_parameters: Mapping[str, tuple[ExpectedParameter, ...]] = {}
     has_all_parameters: bool = False
     unread_parameter_files: tuple[str, ...] = ()
     held_by: HeldBy = HeldBy.STATE_MACHINE
-
-    def in_mode(self, name: str) -> tuple[ExpectedParameter, ...]:
-        """Return what its parameters are in a mode that modes change; empty if none does."""
-        found = (each.parameters for each in self.mode_parameters if each.mode == name)
-        return next(found, ())
 
 
 class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
@@ -421,7 +402,7 @@ def in_mode(plan: Plan, name: str) -> Plan:
 
     def as_in_mode(node: PlannedNode) -> PlannedNode:
         if node.mode_parameters:
-            node = _with_parameters(node, node.in_mode(name))
+            node = _with_parameters(node, node.mode_parameters.get(name, ()))
         if node.key not in switched:
             return node
         state = TargetState.INACTIVE if node.key in mode.inactive else TargetState.ACTIVE
@@ -448,41 +429,17 @@ def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) ->
 
 
 class PlanError(LifecycleError):
-    """A valid manifest that cannot be planned here: no such executable, processes that disagree.
+    """A valid manifest that cannot be planned here: no such executable, not enough ports.
 
     Attributes:
         at: the declaration that cannot be planned; None when no single one is to blame.
-        diagnostics: everything that is wrong, one by one; empty where the message is complete.
     """
 
     exit_code = ExitCode.MANIFEST_INVALID
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        hint: str = "",
-        at: Position | None = None,
-        diagnostics: tuple[Diagnostic, ...] = (),
-    ) -> None:
+    def __init__(self, message: str, *, hint: str = "", at: Position | None = None) -> None:
         super().__init__(message, hint=hint)
         self.at = at
-        self.diagnostics = diagnostics
-
-    @classmethod
-    def of(cls, diagnostics: tuple[Diagnostic, ...]) -> PlanError:
-        """Return the error that reports all of these, at least one, at the place of the first."""
-        first = diagnostics[0]
-        rest = [
-            f"{each.message}; {each.hint}" if each.hint else each.message
-            for each in diagnostics[1:]
-        ]
-        return cls(
-            "\n".join((first.message, *rest)),
-            hint=first.hint,
-            at=first.at,
-            diagnostics=diagnostics,
-        )
 
     def __str__(self) -> str:
         place = f"{self.at.spelled}: " if self.at else ""

@@ -21,7 +21,7 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, Node, ParameterDeclaration, ParameterValue
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.parameter_values import as_type, misfit, portable, type_of
-from lifecycle.plan.model import ExpectedParameter, ModeParameters
+from lifecycle.plan.model import ExpectedParameter
 
 GIVEN = "parameters"
 COMMAND = "command"
@@ -58,34 +58,24 @@ class NodeParameters:
 
     def in_modes(
         self, node: Node, expected: tuple[ExpectedParameter, ...]
-    ) -> tuple[ModeParameters, ...]:
-        """Return what the parameters that some mode sets are in each mode."""
+    ) -> dict[str, tuple[ExpectedParameter, ...]]:
+        """Return, by mode, what the parameters are that some mode sets; empty if none does."""
         known = {each.name: each for each in expected}
         types = {each.name: each.type for each in node.interface.parameters}
-        found = {
-            mode.name: {
-                each.name: _expected(
-                    each.name,
-                    types.get(each.name) or type_of(each.value),
-                    _Given(each.value, f"mode {mode.name}", optional=False, at=each.at),
-                )
-                for each in mode.parameters
-                if each.node == node.key
-            }
-            for mode in self._modes
-        }
+        found: dict[str, dict[str, ExpectedParameter]] = {}
+        for mode in self._modes:
+            found[mode.name] = {}
+            for each in mode.parameters:
+                if each.node == node.key:
+                    type_ = types.get(each.name) or type_of(each.value)
+                    given = _Given(each.value, f"mode {mode.name}", optional=False, at=each.at)
+                    found[mode.name][each.name] = _expected(each.name, type_, given)
         names = dict.fromkeys(name for values in found.values() for name in values)
-        if not names:
-            return ()
-        return tuple(
-            ModeParameters(
-                mode=mode,
-                parameters=tuple(
-                    each for name in names if (each := values.get(name) or known.get(name))
-                ),
-            )
+        return {
+            mode: tuple({**known, **values}[name] for name in names if name in {*known, *values})
             for mode, values in found.items()
-        )
+            if names
+        }
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""

@@ -8,17 +8,21 @@ it, or another host, can show is named as unresolved.
 from __future__ import annotations
 
 import ast
+import builtins
+import contextlib
 import difflib
+import enum
 import functools
+import importlib.machinery
 import importlib.util
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
@@ -26,30 +30,22 @@ from lifecycle.manifest.model import EndpointKind, Manifest, Node, Run, RunKind
 from lifecycle.manifest.parameter_values import is_implicit
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.processes import find_executable
-from lifecycle.plan.python_source import (
-    ACCESS,
-    ClassKind,
-    Handler,
-    NodeClass,
-    NoModuleError,
-    NotThereError,
-    Sources,
-    UnknownError,
-    binds,
-)
 
 RULE = "program.missing"
 UNHANDLED = "program.handler"
-UNDECLARED = "program.endpoint"
-NO_HEALTH = "program.health"
 IMPORT = "program.import"
 UNCALLED = "program.callback"
 PARAMETER = "program.parameter"
 
-_WORDS = {
-    EndpointKind.SUBSCRIPTION: ("subscription", "@on_message"),
-    EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
-    EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
+_HANDLERS = {
+    "on_message": EndpointKind.SUBSCRIPTION,
+    "on_service": EndpointKind.SERVICE_SERVER,
+    "on_action": EndpointKind.ACTION_SERVER,
+    "on_goal": EndpointKind.ACTION_SERVER,
+}
+_HARMLESS = {
+    *("override", "abstractmethod", "on_timer", "setter", "getter", "deleter"),
+    *("property", "staticmethod", "classmethod"),
 }
 _DECLARES = {
     *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
@@ -60,6 +56,9 @@ _CALLBACKS = (
     *("on_disconnect", "on_cleanup", "on_shutdown", "on_error"),
 )
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
+_MOST_IMPORTS = 20
+_DYNAMIC = r"import \*|__getattr__|globals\(\)|vars\(\)|exec\(|sys\.modules"
+"""What makes names of a module that its statements do not show."""
 
 
 class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,6 +86,18 @@ class Resolution(msgspec.Struct, frozen=True, kw_only=True):
     unresolved: tuple[UnresolvedProgram, ...] = ()
 
 
+class _NotThereError(LifecycleError):
+    """Python, or exec(3), would refuse it."""
+
+
+class _NoModuleError(_NotThereError):
+    """There is no such module here; elsewhere there may be one."""
+
+
+class _UnknownError(LifecycleError):
+    """Only running it can show that; the message is the reason, half a sentence."""
+
+
 def resolve_programs(
     manifest: Manifest,
     *,
@@ -101,7 +112,7 @@ def resolve_programs(
         is_ours: whether a machine, by name, is this host; what is missing here of the others is
             unresolved. Code that is found here is judged for them, too.
     """
-    sources = functools.cache(Sources)
+    sources = functools.cache(_Sources)
     found: list[_Found] = []
     for node in manifest.nodes:
         ours = is_ours(node.machine)
@@ -128,17 +139,17 @@ def _command(node: Node, environment: Mapping[str, str], *, ours: bool) -> Itera
             part = "run.executable"
             subject = f"executable {run.executable!r} of package {run.package!r}"
             find_executable(run, environment, at=node.at)
-    except (NotThereError, PlanError) as problem:
+    except (_NotThereError, PlanError) as problem:
         if run.command or environment.get("AMENT_PREFIX_PATH"):
             yield _missing(node, part, subject, problem, ours=ours)
         else:
             reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
-            at = _at(node, "run.package")
+            at = node.where("run.package")
             yield UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
 def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ours: bool) -> _Found:
-    at = _at(node, part)
+    at = node.where(part)
     if ours:
         return error(RULE, at, problem.message, problem.hint)
     here = problem.message.replace("cannot find", "there is no", 1)
@@ -146,24 +157,55 @@ def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ou
     return UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
-def _python(node: Node, sources: Sources, *, ours: bool) -> Iterator[_Found]:
+def _find_command(run: Run, environment: Mapping[str, str]) -> None:
+    """Find a program, and the script of a Python one, as execvp(3) would in its folder.
+
+    Raises:
+        _NotThereError: it is not there.
+    """
+    word, *arguments = run.command
+    folder = Path(run.working_directory or Path.cwd())
+    if not os.path.isdir(folder):
+        raise _NotThereError(f"cannot find the working directory {str(folder)!r}")
+    if "/" in word:
+        _find_file("program", folder / word)
+        if shutil.which(folder / word) is None:
+            raise _NotThereError(f"cannot run {word!r}: it is not executable")
+    else:
+        path = {**environment, **dict(run.environment)}.get("PATH", os.defpath)
+        folders = os.pathsep.join(str(folder / each) for each in path.split(os.pathsep))
+        if shutil.which(word, path=folders) is None:
+            hint = "install it, name its path, or set PATH in run.environment"
+            raise _NotThereError(f"cannot find program {word!r} on PATH", hint=hint)
+    script = next(iter(arguments), "-")
+    if _PYTHON.fullmatch(Path(word).name) and not script.startswith("-"):
+        _find_file("script", folder / script)
+
+
+def _find_file(what: str, file: Path) -> None:
+    if not os.path.exists(file):
+        names: list[str] = []
+        with contextlib.suppress(OSError, ValueError):
+            names = sorted(each.name for each in file.parent.iterdir())
+        hint = did_you_mean(file.name, names)
+        raise _NotThereError(f"cannot find {what} {file.name!r} in {str(file.parent)!r}", hint=hint)
+
+
+def _python(node: Node, sources: _Sources, *, ours: bool) -> Iterator[_Found]:
     subject = f"class {node.run.python!r}"
-    at = _at(node, "run.python")
-    module, separator, name = node.run.python.partition(":")
-    if not separator or not module or not name.isidentifier():
-        yield error(RULE, at, f"cannot read {node.run.python!r}; write package.module:Class")
-        return
+    at = node.where("run.python")
+    module, _, name = node.run.python.partition(":")
     try:
         found = sources.read_class(module, name)
-    except NotThereError as problem:
+    except _NotThereError as problem:
         # A module that is not here may be there; one that is here lacks the class there, too.
-        here = ours or not isinstance(problem, NoModuleError)
+        here = ours or not isinstance(problem, _NoModuleError)
         yield _missing(node, "run.python", subject, problem, ours=here)
         return
-    except UnknownError as problem:
+    except _UnknownError as problem:
         yield UnresolvedProgram(at=at, subject=subject, reason=problem.message)
         return
-    if found.kind is ClassKind.NO_NODE:
+    if found.kind is _Kind.NO_NODE:
         yield error(
             RULE,
             at,
@@ -171,40 +213,27 @@ def _python(node: Node, sources: Sources, *, ours: bool) -> Iterator[_Found]:
             "derive it from lifecycle.LifecycleNode, or from rclpy.node.Node",
         )
         return
-    yield from _called(node, found, at)
-    yield from _without_health(node, found)
+    if node.managed and found.kind is _Kind.PLAIN:
+        message = f"cannot manage {node.key!r}: {name} ({found.file}) is a plain node"
+        hint = "write 'managed: false'; it is held by its executor until the system is verified"
+        yield error(RULE, at, message, hint)
     # What of a class is unknown may bring along what seems to be missing.
-    if ours and not found.unknown and importlib.util.find_spec("rclpy"):
+    if found.unknown:
+        of = "handlers" if found.kind is _Kind.OURS else "node class"
+        yield UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
+    elif ours and importlib.util.find_spec("rclpy"):
         for package, place in sources.missing(found):
             message = f"cannot import {package!r}, as {place} does: it is not installed here"
             yield warning(IMPORT, at, message, "install it where the node runs")
     yield from _uncalled(found, at)
     if not found.unknown and not node.parameter_files:
         yield from _parameters(node, found, at)
-    yield from _interface(node, found, at, subject)
-
-
-def _interface(node: Node, found: NodeClass, at: Position, subject: str) -> Iterator[_Found]:
-    """Compare what a class handles and asks for with what the node declares."""
-    ours = found.kind is ClassKind.OURS
-    problems = [*_pairs(node, found, at)] if ours else []
-    asks = [*_undeclared(node, found, at)] if ours else []
-    if found.unknown:
-        of = "handlers" if ours else "node class"
-        yield UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
-        # What is there is there, whatever else may be.
-        problems = [each for each in problems if each.message.startswith("cannot use")]
-    declares = any(
-        isinstance(each, ast.Attribute) and each.attr in _DECLARES
-        for _, statement in found.body
-        for each in ast.walk(statement)
-    )
-    if declares and (problems or asks):
-        first = f"; {problems[0].message}" if problems else ""
-        reason = f"its code declares endpoints itself{first}"
+    problems = [*_endpoints(node, found, at)] if found.kind is _Kind.OURS else []
+    if problems and any(call.rpartition(".")[2] in _DECLARES for call, _, _ in found.calls):
+        reason = f"its code declares endpoints itself; {problems[0].message}"
         yield UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
-        return
-    yield from (*problems, *asks)
+    else:
+        yield from problems
 
 
 def _folders(node: Node) -> tuple[str, ...]:
@@ -215,221 +244,280 @@ def _folders(node: Node) -> tuple[str, ...]:
     return tuple(dict.fromkeys((first, *beside, *filter(None, given), str(Path.cwd()))))
 
 
-def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    """Yield what keeps a class or function from being called and hosted as the manifest says."""
-    if found.spins:
-        yield error(
-            RULE,
-            at,
-            f"cannot host the nodes of {found.name!r}: it calls {found.spins}, which their host "
-            "does",
-            "name the node's class, or a function that returns nodes without spinning them",
-        )
-    if node.managed and found.kind is ClassKind.PLAIN:
-        yield error(
-            RULE,
-            at,
-            f"cannot manage {node.key!r}: {found} is a plain node",
-            "write 'managed: false'; it is held by its executor until the system is verified",
-        )
-    arguments = dict(node.run.arguments)
-    where = _at(node, "run")
-    if found.takes is not None:
-        for name in arguments:
-            if name not in found.takes:
-                yield error(
-                    RULE,
-                    where,
-                    f"cannot give {found} an argument {name!r}",
-                    did_you_mean(name, found.takes)
-                    or f"it takes {', '.join(found.takes) or 'none'}",
+def _endpoints(node: Node, found: _Class, at: Position) -> Iterator[Diagnostic]:
+    """Yield handlers without endpoint, and endpoints without handler."""
+    declared: dict[EndpointKind, dict[str, Position]] = {}
+    for each in node.interface.endpoints:
+        declared.setdefault(each.kind, {})[each.name] = each.at
+    served = {(call.removeprefix("lifecycle."), name) for call, name, _ in found.calls}
+    for call, name, place in found.calls:
+        kind = _HANDLERS.get(call.removeprefix("lifecycle."))
+        if kind and name and name not in (known := declared.get(kind, {})):
+            message = f"cannot use handler @{call}({name!r}) ({place}): {node.key!r} declares no"
+            yield error(UNHANDLED, at, f"{message} {kind.noun} {name!r}", _declared(name, known))
+    for word, kind in _HANDLERS.items() if not found.unknown else ():
+        for name, where in declared.get(kind, {}).items():
+            if word != "on_goal" and served.isdisjoint({(word, name), (word, None)}):
+                message = (
+                    f"cannot serve {kind.noun} {name!r}: no method of {found.name} ({found.file}) "
+                    f"is decorated with @{word}({name!r})"
                 )
-    # rclpy's own name for what the manifest says anyway.
-    missing = [each for each in found.needs if each not in (*arguments, "node_name")]
-    if missing:
-        yield error(
-            RULE,
-            where,
-            f"cannot call {found} without {', '.join(missing)}",
-            "give it under 'run: {arguments: …}'",
-        )
+                yield error(UNHANDLED, where, message)
 
 
-def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
-    """Yield that a node is to be asked for its health whose class has nothing to ask."""
-    if node.health is None or not node.health.check or not node.managed:
-        return
-    why = ""
-    if found.kind in (ClassKind.MANAGED, ClassKind.PLAIN):
-        why, advice = "is not a lifecycle.LifecycleNode", "derive it from lifecycle.LifecycleNode"
-    elif (
-        found.kind is ClassKind.OURS
-        and not found.unknown
-        and not any("health" in binds(statement) for _, statement in found.body)
-    ):
-        why = "has no method 'health'"
-        advice = (
-            "give it 'def health(self)', which returns None if all is well and else what is wrong"
-        )
-    if why:
-        yield error(
-            NO_HEALTH,
-            node.where("health"),
-            f"cannot ask {node.key!r} whether it is healthy: {found} {why}",
-            f"{advice}, or write 'health: {{diagnostics: NAME}}'",
-        )
-
-
-def _find_command(run: Run, environment: Mapping[str, str]) -> None:
-    """Find a program, and the script of a Python one, as execvp(3) would in its folder.
-
-    Raises:
-        NotThereError: it is not there.
-    """
-    word, *arguments = run.command
-    folder = Path(run.working_directory or Path.cwd())
-    if not os.path.isdir(folder):
-        raise NotThereError(f"cannot find the working directory {str(folder)!r}")
-    if "/" in word:
-        file = folder / word
-        if not os.path.exists(file):
-            near = did_you_mean(file.name, _names(file.parent))
-            where = "" if Path(word).is_absolute() else f" in {str(folder)!r}"
-            raise NotThereError(f"cannot find program {word!r}{where}", hint=near)
-        if not os.path.isfile(file) or not os.access(file, os.X_OK):
-            hint = f"chmod +x {word}" if os.path.isfile(file) else ""
-            raise NotThereError(f"cannot run {word!r}: it is not executable", hint=hint)
-    else:
-        path = {**environment, **dict(run.environment)}.get("PATH", os.defpath)
-        folders = os.pathsep.join(str(folder / each) for each in path.split(os.pathsep))
-        if shutil.which(word, path=folders) is None:
-            raise NotThereError(
-                f"cannot find program {word!r} on PATH",
-                hint="install it, name its path, or set PATH in run.environment",
-            )
-    script = next(iter(arguments), "-")
-    if _PYTHON.fullmatch(Path(word).name) and not script.startswith("-"):
-        file = folder / script
-        if not os.path.exists(file):
-            near = did_you_mean(file.name, _names(file.parent))
-            raise NotThereError(f"cannot find script {script!r} in {str(folder)!r}", hint=near)
-
-
-def _names(folder: Path) -> tuple[str, ...]:
-    try:
-        return tuple(sorted(each.name for each in folder.iterdir()))
-    except OSError:
-        return ()
-
-
-def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    """Yield what `node.handlers.match` would refuse when the node is configured."""
-    wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
-    taken: dict[tuple[EndpointKind, str, bool], Handler] = {}
-    for each in found.handlers:
-        noun, decorator = _WORDS[each.kind]
-        decorator = "@on_goal" if each.decides else decorator
-        if (each.kind, each.name) not in wanted:
-            declared = [name for kind, name in wanted if kind is each.kind]
-            yield error(
-                UNHANDLED,
-                at,
-                f"cannot use handler {each.text} ({each.place}): {decorator}({each.name!r}) "
-                f"names no {noun} that {node.key!r} declares",
-                _declared(each.name, declared),
-            )
-        elif first := taken.get((each.kind, each.name, each.decides)):
-            yield error(
-                UNHANDLED,
-                at,
-                f"cannot use two handlers of {noun} {each.name!r}: {first.text} ({first.place}) "
-                f"and {each.text} ({each.place})",
-            )
-        taken.setdefault((each.kind, each.name, each.decides), each)
-    for (kind, name), endpoint in wanted.items():
-        if (kind, name, False) not in taken:
-            noun, decorator = _WORDS[kind]
-            yield error(
-                UNHANDLED,
-                endpoint.at,
-                f"cannot serve {noun} {name!r}: no method of {found} is decorated with "
-                f"{decorator}({name!r})",
-            )
-
-
-def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    """Yield the endpoints that code asks for by a literal name, and that are not declared."""
-    for of, method in found.methods:
-        for call in ast.walk(method):
-            match call:
-                case ast.Call(
-                    func=ast.Attribute(value=ast.Name(id="self"), attr=attr),
-                    args=[ast.Constant(value=str(name))],
-                ) if attr in ACCESS:
-                    kind = ACCESS[attr]
-                    declared = [e.name for e in node.interface.endpoints if e.kind is kind]
-                    if name not in declared:
-                        yield warning(
-                            UNDECLARED,
-                            at,
-                            f"cannot tell what {ast.unparse(call)[:80]} ({of.place(call)}) is to "
-                            f"get: {node.key!r} declares no {kind.noun} {name!r}",
-                            _declared(name, declared),
-                        )
-
-
-def _uncalled(found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+def _uncalled(found: _Class, at: Position) -> Iterator[Diagnostic]:
     """Yield methods that are called almost as a transition callback is, and by nothing."""
-    for of, method in found.methods if found.kind is not ClassKind.PLAIN else ():
-        name = method.name
-        if not name.startswith("on_") or name in _CALLBACKS or method.decorator_list:
-            continue
-        near = difflib.get_close_matches(name, _CALLBACKS, n=1, cutoff=0.85)
-        if near and len(re.findall(rf"\b{name}\b", of.module.text)) == 1:
-            what = f"{of.node.name}.{name} ({of.place(method)})"
-            message = f"cannot tell what {what} is for: nothing calls it"
-            yield warning(UNCALLED, at, message, f"did you mean {near[0]!r}?")
+    for module, class_ in found.bases if found.kind is not _Kind.PLAIN else ():
+        for method in class_.body:
+            if not isinstance(method, _Function) or method.decorator_list:
+                continue
+            name = method.name
+            near = difflib.get_close_matches(name, _CALLBACKS, n=1, cutoff=0.85)
+            is_slip = name.startswith("on_") and name not in _CALLBACKS and near
+            if is_slip and len(re.findall(rf"\b{name}\b", module.text)) == 1:
+                what = f"{class_.name}.{name} ({module.place(method)})"
+                message = f"cannot tell what {what} is for: nothing calls it"
+                yield warning(UNCALLED, at, message, f"did you mean {near[0]!r}?")
 
 
-def _parameters(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
+def _parameters(node: Node, found: _Class, at: Position) -> Iterator[Diagnostic]:
     """Yield the parameters that code gets by a literal name, and that nothing declares."""
-    gets: list[tuple[str, str]] = []
     declared = [each.name for each in node.interface.parameters]
     known = {*declared, *(name for name, _ in node.parameters)}
-    for of, statement in found.body:
-        for part in ast.walk(statement):
-            match part:
-                case ast.Call(
-                    func=ast.Attribute(attr="declare_parameter"), args=[ast.Constant(name), *_]
-                ):
-                    known.add(str(name))
-                case ast.Call(func=ast.Attribute(attr="declare_parameter"), args=[_, *_]):
-                    return  # under a name that only running it shows
-                case ast.Attribute(attr="declare_parameters"):
-                    return
-                case ast.keyword(arg=str(word)) if "_parameters" in word:
-                    return  # allow_undeclared_parameters and its like
-                case ast.Call(
-                    func=ast.Attribute(value=ast.Name(id="self"), attr="get_parameter"),
-                    args=[ast.Constant(value=str(name))],
-                ):
-                    gets.append((name, of.place(part)))
-    for name, place in gets:
-        if name not in known and not is_implicit(name):
+    declares = {name for call, name, _ in found.calls if call.endswith(".declare_parameter")}
+    # A name that is computed may be any, and `allow_undeclared_parameters` and its like allow all.
+    many = any(re.search("declared?_parameters", module.text) for module, _ in found.bases)
+    for call, name, place in () if many or None in declares else found.calls:
+        if call != "self.get_parameter" or name is None:
+            continue
+        if name not in known | declares and not is_implicit(name):
             message = (
                 f"cannot get parameter {name!r} in {place}: {node.key!r} declares none of that name"
             )
             yield warning(PARAMETER, at, message, _declared(name, declared))
 
 
-def _declared(name: str, declared: list[str]) -> str:
+def _declared(name: str, declared: Collection[str]) -> str:
     listed = ", ".join(map(repr, declared)) or "none"
-    near = did_you_mean(name, declared)
-    return f"{near} declared: {listed}" if near else f"declared: {listed}"
+    return f"{did_you_mean(name, declared)} declared: {listed}".lstrip()
 
 
-def _at(node: Node, part: str) -> Position:
-    at = node.where(part)
-    at = node.where("run") if at == node.at else at
-    known = at.path.endswith(part)
-    return at if known else replace(at, path=f"nodes.{node.key}.{part}")
+class _Kind(enum.Enum):
+    """What kind of node a class is; the names of what need not be read to know that."""
+
+    OURS = r"lifecycle\.(\w+\.)*LifecycleNode"
+    MANAGED = r"rclpy\.((\w+\.)*LifecycleNode(Mixin)?|lifecycle\..*)"
+    PLAIN = r"rclpy\.(\w+\.)*Node"
+    NO_NODE = r"(builtins|typing|abc|enum|typing_extensions)\.\w+"
+    UNKNOWN = r"\Z."  # a base cannot be found, or it is a function that returns nodes
+
+
+_Function = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+class _Module(msgspec.Struct):
+    """A module's source.
+
+    Attributes:
+        names: what its top imports and defines, by full name.
+        definitions: its classes, and functions without decorators.
+    """
+
+    name: str
+    file: str
+    text: str
+    body: list[ast.stmt]
+    names: dict[str, str]
+    definitions: dict[str, ast.ClassDef | ast.FunctionDef]
+
+    def place(self, node: ast.stmt | ast.expr) -> str:
+        """Return where a part of it is, `file:line`."""
+        return f"{self.file}:{node.lineno}"
+
+    def full_name(self, expression: ast.expr) -> str:
+        """Return the full name of what an expression names; empty if it is not a plain name."""
+        head, _, rest = ast.unparse(expression).partition("[")[0].partition(".")
+        full = self.names.get(head, f"builtins.{head}" if hasattr(builtins, head) else "")
+        return f"{full}.{rest}".rstrip(".") if full else ""
+
+
+class _Class(msgspec.Struct, kw_only=True):
+    """What the source of a class, or of a function that returns nodes, shows.
+
+    Attributes:
+        bases: the class and its bases, as far as they were found; none of a function.
+        calls: what its code calls, the first argument if that is a text, and `file:line`.
+        unknown: why more may belong to it than is known; empty if nothing does.
+    """
+
+    name: str
+    file: str = "rclpy"
+    kind: _Kind = _Kind.UNKNOWN
+    bases: list[tuple[_Module, ast.ClassDef]] = []
+    calls: list[tuple[str, str | None, str]] = []
+    unknown: str = ""
+
+
+class _Sources:
+    """Modules as one process would find them, which looks first in some folders."""
+
+    def __init__(self, folders: Sequence[str]) -> None:
+        self._folders = tuple(folders)
+        self._modules: dict[str, _Module] = {}
+        importlib.invalidate_caches()
+
+    def read_class(self, module: str, name: str) -> _Class:
+        """Return what the class, or function, `module:name` is.
+
+        Raises:
+            _NotThereError: there is no such module, or no such class in it.
+            _UnknownError: that cannot be decided.
+        """
+        found = self._named(f"{module}.{name}")
+        if isinstance(found, _Kind):
+            return _Class(name=name, kind=found)
+        class_ = _Class(name=name, file=found[0].file)
+        if isinstance(found[1], ast.ClassDef):
+            class_.kind = self._collect(found[0], found[1], class_)
+            if class_.unknown and class_.kind in (_Kind.PLAIN, _Kind.NO_NODE):
+                class_.kind = _Kind.UNKNOWN
+            _read_methods(class_)
+        return class_
+
+    def _collect(self, module: _Module, node: ast.ClassDef, into: _Class) -> _Kind:
+        """Add a class and its bases to what is known; return what kind it is."""
+        kinds = {_Kind.NO_NODE}
+        into.bases.append((module, node))
+        if node.decorator_list or node.keywords:
+            into.unknown = into.unknown or f"class {node.name} has a decorator or a metaclass"
+        for base in node.bases:
+            try:
+                found = self._named(module.full_name(base))
+            except (_NotThereError, _UnknownError) as problem:
+                why = f"its base {ast.unparse(base)} is not known: {problem}"
+                into.unknown = into.unknown or why
+                continue
+            if isinstance(found, _Kind):
+                kinds.add(found)
+            elif isinstance(found[1], ast.ClassDef) and found not in into.bases:
+                kinds.add(self._collect(found[0], found[1], into))
+        return next(each for each in _Kind if each in kinds)
+
+    def missing(self, found: _Class) -> Iterator[tuple[str, str]]:
+        """Yield what the top of a class's module imports and is not there: package, `file:line`."""
+        for module, _ in found.bases[:1]:
+            for statement in module.body:
+                names: list[str] = []
+                if isinstance(statement, ast.Import):
+                    names = [each.name for each in statement.names]
+                elif isinstance(statement, ast.ImportFrom) and not statement.level:
+                    names = [str(statement.module)]
+                for package in dict.fromkeys(each.partition(".")[0] for each in names):
+                    if self._spec(package) is None:
+                        yield package, module.place(statement)
+
+    def _named(
+        self, dotted: str, depth: int = 0
+    ) -> tuple[_Module, ast.ClassDef | ast.FunctionDef] | _Kind:
+        """Return what a full name stands for, through imports; its kind where that is known.
+
+        Raises:
+            _NotThereError: nothing in its module is called so.
+            _UnknownError: that cannot be decided.
+        """
+        for kind in _Kind:
+            if re.fullmatch(kind.value, dotted):
+                return kind
+        place, _, name = dotted.rpartition(".")
+        if not place or depth > _MOST_IMPORTS:
+            raise _UnknownError("it has to be evaluated")
+        module = self._modules.get(place) or self._modules.setdefault(place, self._read(place))
+        if name in module.definitions:
+            return module, module.definitions[name]
+        full = module.names.get(name, "")
+        if full.rpartition(".")[0] and full != dotted:
+            return self._named(full, depth + 1)
+        if re.search(rf"\b{re.escape(name)}\b|{_DYNAMIC}", module.text):
+            raise _UnknownError(f"{name} is made by running {module.file}")
+        classes = [each for each in module.definitions if not each.startswith("_")]
+        raise _NotThereError(
+            f"cannot find class {name!r} in {module.name} ({module.file}); it has "
+            f"{', '.join(classes) or 'none'}",
+            hint=did_you_mean(name, classes),
+        )
+
+    def _spec(self, package: str) -> importlib.machinery.ModuleSpec | None:
+        """Return where a package is, at the top: also built in, or an editable installation."""
+        folders = (*self._folders, *filter(None, sys.path))
+        with contextlib.suppress(ImportError, AttributeError, ValueError):
+            return importlib.machinery.PathFinder.find_spec(
+                package, folders
+            ) or importlib.util.find_spec(package)
+        return None
+
+    def _locate(self, name: str) -> str:
+        """Return the source file of a module."""
+        first, *parts = name.split(".")
+        spec = self._spec(first)
+        for part in parts if spec else ():
+            inside = spec.submodule_search_locations if spec else None
+            spec = importlib.machinery.PathFinder.find_spec(part, inside or ())
+        if spec is None:
+            where = f"it is looked for in {', '.join(self._folders)} and in what is installed"
+            raise _NoModuleError(f"cannot find module {name!r}", hint=where)
+        if not spec.origin or not spec.origin.endswith(".py"):
+            raise _UnknownError(f"{name} is not written in Python")
+        return spec.origin
+
+    def _read(self, name: str) -> _Module:
+        file = Path(self._locate(name))
+        short = str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file)
+        try:
+            text = file.read_text("utf-8-sig", "replace")
+            body = ast.parse(text).body
+        except SyntaxError as problem:
+            where = f"{short}:{problem.lineno}: {problem.msg}"
+            raise _NotThereError(f"cannot import {name!r}: {where}") from problem
+        except (OSError, ValueError, RecursionError, MemoryError) as problem:
+            raise _UnknownError(f"{short} cannot be read: {problem}") from problem
+        module = _Module(name, short, text, body, {}, {})
+        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+        for statement in body:
+            match statement:
+                case ast.Import():
+                    for alias in statement.names:
+                        first = alias.name.partition(".")[0]  # `import a.b` binds `a`
+                        module.names[alias.asname or first] = alias.name if alias.asname else first
+                case ast.ImportFrom():
+                    parts = package.split(".")
+                    parts = parts[: len(parts) - statement.level + 1] if statement.level else []
+                    start = ".".join([*parts, *filter(None, [statement.module])])
+                    for alias in statement.names:
+                        module.names[alias.asname or alias.name] = f"{start}.{alias.name}"
+                case ast.ClassDef() | ast.FunctionDef(decorator_list=[]):
+                    module.names[statement.name] = f"{name}.{statement.name}"
+                    module.definitions[statement.name] = statement
+        return module
+
+
+def _read_methods(class_: _Class) -> None:
+    """Read what the methods of a class and its bases call, decorators included."""
+    hidden: set[str] = set()  # a handler hides that of its name in the bases
+    for module, node in class_.bases:
+        for statement in node.body:
+            name = getattr(statement, "name", "")
+            decorators = getattr(statement, "decorator_list", [])
+            if name in hidden:
+                continue
+            hidden.update([name] if decorators else [])
+            for each in map(ast.unparse, decorators):
+                shown = each.partition("(")[0]
+                if shown.rpartition(".")[2] not in {*_HANDLERS, *_HARMLESS}:
+                    why = f"{node.name}.{name} is decorated with @{shown}"
+                    class_.unknown = class_.unknown or why
+            for part in ast.walk(statement):
+                match part:
+                    case ast.Call(args=[ast.Constant(value=str(text)), *_]):
+                        class_.calls.append((ast.unparse(part.func), text, module.place(part)))
+                    case ast.Call():
+                        class_.calls.append((ast.unparse(part.func), None, module.place(part)))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Iterator
 
 from lifecycle.manifest.model import (
     DataLayer,
     DataLayerSource,
     DiscoveryMode,
     FlowTransport,
+    Quantity,
     RunKind,
     UniqueHow,
 )
@@ -26,113 +27,37 @@ from lifecycle.plan.model import (
 )
 from lifecycle.printable import columns, count
 
-
-def _data_layer(plan: Plan, width: int) -> list[str]:
-    """Describe how participants find each other and who connects them; nothing if all is usual."""
-    rows: list[tuple[str, str]] = []
-    mode, transport = plan.discovery.mode, plan.discovery.transport
-    if mode is not DiscoveryMode.DYNAMIC or transport is not FlowTransport.ANY:
-        told = "" if transport is FlowTransport.ANY else f", own participants by {transport.value}"
-        rows.append(("discovery", f"{mode.value}{told}"))
-    if plan.server is not None:
-        protocol = "TCP" if plan.server.tcp else "UDP"
-        where = f" on machine {plan.server.machine}" if plan.server.machine else ""
-        at = f"{plan.server.address}:{plan.server.port}"
-        rows.append(("discovery server", f"{protocol} {at}{where}"))
-    layer, usual = plan.data_layer, DataLayer()
-    if (layer.authority, layer.source) != (usual.authority, usual.source) or layer.events:
-        source = "the manifest" if layer.source is DataLayerSource.STATIC else "node configurations"
-        again = "; what is lost is made again" if layer.events else ""
-        rows.append(("authority", f"{layer.authority.value}, from {source}{again}"))
-    for machine, each in plan.observers:
-        named = f"observer on {machine}" if machine else "observer"
-        if machine and any(not other for other, _ in plan.observers):
-            continue  # the one host's, under another name
-        rows += [(named if not i else "", text) for i, text in enumerate(_spelled(each))]
-    return columns(rows, indent=2, width=width)
-
-
-def _connections(plan: Plan, width: int) -> list[str]:
-    """List each node's participants with their URLs and what they carry."""
-    lines: list[str] = []
-    for node in plan.nodes:
-        extra = [each for each in node.participants if each.connection or each.connections.urls]
-        entries = [(each.connection or each.name, each.connections, each.name) for each in extra]
-        if not extra and not node.connections.urls:
-            continue
-        rows: list[tuple[str, str]] = []
-        for name, each, participant in (("own participant", node.connections, ""), *entries):
-            carried = [
-                f"{endpoint.kind.noun} {endpoint.resolved}"
-                for endpoint in node.endpoints
-                if endpoint.participant == participant
-            ]
-            texts = _spelled(each) + [f"carries {', '.join(carried)}"] * bool(carried)
-            rows += [("" if index else name, text) for index, text in enumerate(texts)]
-        lines += [f"  {node.full_name}", *columns(rows, indent=4, width=width)]
-    return lines
-
-
-def _spelled(each: ParticipantConnections) -> list[str]:
-    texts = list(each.urls) or ["as the RMW chooses"]
-    if each.static_name:
-        texts.append(f"known to others as {each.static_name}, without being told")
-    if each.super_client:
-        texts.append("is told of everything that the server knows")
-    return texts
-
-
-def _participants(plan: Plan, width: int) -> list[str]:
-    """List extra participants."""
-    rows = [
-        (f"{node.namespace.rstrip('/')}/{each.name}", each.reason)
-        for node in plan.nodes
-        for each in node.participants
-    ]
-    return columns(rows, indent=2, width=width)
+_Rows = Iterator[tuple[str, ...]]
 
 
 def render_text(plan: Plan, *, width: int = 100) -> str:
-    """Print processes, order, nodes with endpoints, extra participants and flows.
+    """Print processes, order, nodes with endpoints, participants and flows.
 
     Lines fit into `width` columns, at least 40, where words allow it.
     """
-    width = max(width, 40)
-    sections: tuple[tuple[str, Callable[[Plan, int], list[str]]], ...] = (
-        ("processes", _processes),
-        ("order", _order),
-        ("data layer", _data_layer),
-        ("nodes", _nodes),
-        ("connections", _connections),
-        ("extra participants", _participants),
-        ("flows", _flows),
-    )
-    lines = [_headline(plan)]
-    for title, section in sections:
-        body = section(plan, width)
-        if body:
-            lines += ["", title, *body]
-    return "\n".join(lines) + "\n"
-
-
-def _headline(plan: Plan) -> str:
     counts = (
         count(len(plan.nodes), "node"),
         count(len(plan.processes), "process"),
         count(len(plan.flows), "flow"),
     )
-    return (
-        f"system {plan.system}: {', '.join(counts)};"
-        f" domain {plan.domain_id}, discovery range {plan.discovery_range.value}"
-    )
+    where = f"domain {plan.domain_id}, discovery range {plan.discovery_range.value}"
+    lines = [f"system {plan.system}: {', '.join(counts)}; {where}"]
+    for title, section in (
+        ("processes", _processes(plan)),
+        ("order", _order(plan)),
+        ("data layer", _data_layer(plan)),
+        ("nodes", _nodes(plan)),
+        ("participants", _participants(plan)),
+        ("flows", _flows(plan)),
+    ):
+        if rows := list(section):
+            lines += ["", title, *columns(rows, indent=2, width=max(width, 40))]
+    return "\n".join(lines) + "\n"
 
 
-def _processes(plan: Plan, width: int) -> list[str]:
-    rows = [
-        (process.name, process.machine, process.run.kind.value, _started_as(plan, process))
-        for process in plan.processes
-    ]
-    return columns(rows, indent=2, width=width)
+def _processes(plan: Plan) -> _Rows:
+    for each in plan.processes:
+        yield each.name, each.machine, each.run.kind.value, _started_as(plan, each)
 
 
 def _started_as(plan: Plan, process: PlannedProcess) -> str:
@@ -143,15 +68,9 @@ def _started_as(plan: Plan, process: PlannedProcess) -> str:
     return ", ".join(plan.node(key).run.python for key in process.nodes)
 
 
-def _order(plan: Plan, width: int) -> list[str]:
-    return columns(
-        [
-            (f"{number}.", ", ".join(_waiting(plan.node(key)) for key in level))
-            for number, level in enumerate(plan.levels, start=1)
-        ],
-        indent=2,
-        width=width,
-    )
+def _order(plan: Plan) -> _Rows:
+    for number, level in enumerate(plan.levels, start=1):
+        yield f"{number}.", ", ".join(_waiting(plan.node(key)) for key in level)
 
 
 def _waiting(node: PlannedNode) -> str:
@@ -159,19 +78,46 @@ def _waiting(node: PlannedNode) -> str:
     return f"{node.key} (after {waits})" if waits else node.key
 
 
-def _nodes(plan: Plan, width: int) -> list[str]:
-    lines: list[str] = []
+def _data_layer(plan: Plan) -> _Rows:
+    """Describe how participants find each other and who connects them; nothing if all is usual."""
+    discovery, layer, usual = plan.discovery, plan.data_layer, DataLayer()
+    transport = discovery.transport
+    how = "" if transport is FlowTransport.ANY else f", own participants by {transport.value}"
+    if how or discovery.mode is not DiscoveryMode.DYNAMIC:
+        yield "discovery", f"{discovery.mode.value}{how}"
+    if plan.server is not None:
+        protocol = "TCP" if plan.server.tcp else "UDP"
+        where = f" on machine {plan.server.machine}" if plan.server.machine else ""
+        yield "discovery server", f"{protocol} {plan.server.address}:{plan.server.port}{where}"
+    if (layer.authority, layer.source) != (usual.authority, usual.source) or layer.events:
+        source = "the manifest" if layer.source is DataLayerSource.STATIC else "node configurations"
+        again = "; what is lost is made again" if layer.events else ""
+        yield "authority", f"{layer.authority.value}, from {source}{again}"
+    for machine, each in plan.observers:
+        yield f"observer {machine}".rstrip(), _spelled(each)
+
+
+def _spelled(each: ParticipantConnections) -> str:
+    texts = list(each.urls) or ["as the RMW chooses"]
+    if each.static_name:
+        texts.append(f"known to others as {each.static_name} without announcement")
+    if each.super_client:
+        texts.append("finds everything that the server knows")
+    return " ".join(texts)
+
+
+def _nodes(plan: Plan) -> _Rows:
     for node in plan.nodes:
-        facts = [
+        facts = (
             "managed" if node.managed else "not managed",
             f"process {node.process}",
             *([f"machine {node.machine}"] if node.machine else []),
             f"endpoints {node.endpoint_policy.value}",
-        ]
-        lines.append(f"  {node.full_name} ({', '.join(facts)})")
-        lines.append(f"    {_HELD[node.held_by]}")
-        lines += _endpoints(node, width)
-    return lines
+            _HELD[node.held_by],
+        )
+        yield node.full_name, ", ".join(facts)
+        for each in node.endpoints:
+            yield f"  {each.kind.noun} {each.resolved}", "; ".join(_endpoint_facts(each))
 
 
 _HELD = {
@@ -182,90 +128,68 @@ _HELD = {
 }
 
 
-def _endpoints(node: PlannedNode, width: int) -> list[str]:
-    """One line each where all of them fit, else what it is and below it what it needs."""
-    rows = [
-        (each.kind.noun, each.resolved, each.type, _endpoint_facts(each)) for each in node.endpoints
-    ]
-    lines = columns(rows, indent=4, width=width)
-    if len(lines) == len(rows) and all(len(line) <= width for line in lines):
-        return lines
-    lines = []
-    heads = columns([row[:3] for row in rows], indent=4, width=width)
-    for head, row in zip(heads, rows, strict=True):
-        lines += [head, *columns([row[3:]], indent=8, width=width)] if row[3] else [head]
-    return lines
-
-
-def _endpoint_facts(endpoint: PlannedEndpoint) -> str:
-    facts = [spell_qos(endpoint.qos)] if endpoint.qos else []
+def _endpoint_facts(endpoint: PlannedEndpoint) -> Iterator[str]:
+    yield endpoint.type
+    if endpoint.qos:
+        yield spell_qos(endpoint.qos)
     if endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
-        facts.append(f"unique {endpoint.unique.value}")
+        yield f"unique {endpoint.unique.value}"
     if endpoint.dscp is not None:
-        kept = "" if endpoint.enforce_dscp else ", not enforced"
-        facts.append(f"{describe(endpoint.dscp)}{kept}")
+        yield describe(endpoint.dscp) + ("" if endpoint.enforce_dscp else ", not enforced")
     if endpoint.five_qi is not None:
-        facts.append(endpoint.five_qi_reason or f"5QI {endpoint.five_qi}")
+        yield endpoint.five_qi_reason or f"5QI {endpoint.five_qi}"
     if endpoint.transport is FlowTransport.NETWORK:
-        facts.append("by the network only")
-    facts += [
-        text
-        for value, text in (
-            (endpoint.max_delay_ms, f"at most {endpoint.max_delay_ms or 0:g} ms"),
-            (endpoint.max_message_size, f"at most {endpoint.max_message_size} bytes"),
-        )
-        if value is not None
-    ]
-    facts += [str(each) for each in endpoint.quantities if each.name in _SHOWN]
-    if endpoint.participant:
-        facts.append(f"in {endpoint.participant}")
-    return "; ".join(facts)
+        yield "by the network only"
+    if endpoint.max_message_size is not None:
+        yield f"at most {endpoint.max_message_size} bytes"
+    yield from _numbers(endpoint.max_delay_ms, endpoint.quantities)
 
 
-_SHOWN = ("rate_hz", "loss", "max_silence_s")
-"""Numbers that are shown as they are written."""
+def _numbers(max_delay_ms: float | None, quantities: tuple[Quantity, ...]) -> Iterator[str]:
+    if max_delay_ms is not None:
+        yield f"at most {max_delay_ms:g} ms"
+    for each in quantities:
+        if each.name in ("rate_hz", "loss", "max_silence_s"):
+            yield str(each)
 
 
 def spell_qos(qos: QosProfile) -> str:
     """Spell a profile in one line: `BEST_EFFORT VOLATILE KEEP_LAST(1), deadline 100 ms`."""
-    history = qos.history.value
-    if qos.history is History.KEEP_LAST:
-        history += f"({qos.depth})"
-    text = f"{qos.reliability.value} {qos.durability.value} {history}"
-    extras = [
-        f"{word} {_duration(value)}"
-        for word, value in (
-            ("deadline", qos.deadline_ns),
-            ("lifespan", qos.lifespan_ns),
-            ("lease", qos.liveliness_lease_duration_ns),
-        )
-        if value
-    ]
+    depth = f"({qos.depth})" if qos.history is History.KEEP_LAST else ""
+    words = [f"{qos.reliability.value} {qos.durability.value} {qos.history.value}{depth}"]
+    for word, value in (
+        ("deadline", qos.deadline_ns),
+        ("lifespan", qos.lifespan_ns),
+        ("lease", qos.liveliness_lease_duration_ns),
+    ):
+        if value:
+            best = value == BEST_AVAILABLE_NS
+            words.append(f"{word} {'BEST_AVAILABLE' if best else f'{value / 1e6:g} ms'}")
     if qos.liveliness not in (Liveliness.AUTOMATIC, Liveliness.SYSTEM_DEFAULT):
-        extras.append(f"liveliness {qos.liveliness.value}")
-    return ", ".join([text, *extras])
+        words.append(f"liveliness {qos.liveliness.value}")
+    return ", ".join(words)
 
 
-def _duration(duration_ns: int) -> str:
-    return "BEST_AVAILABLE" if duration_ns == BEST_AVAILABLE_NS else f"{duration_ns / 1e6:g} ms"
+def _participants(plan: Plan) -> _Rows:
+    """List participants beside nodes' own, and those that are not as the RMW chooses."""
+    for node in plan.nodes:
+        if node.connections.urls:
+            yield f"of {node.full_name} itself", _spelled(node.connections)
+        for each in node.participants:
+            carried = (e.kind.spell(e.name) for e in node.endpoints if e.participant == each.name)
+            name = f"{node.namespace.rstrip('/')}/{each.name}"
+            yield name, f"{each.reason}: {_spelled(each.connections)}"
+            yield "", f"carries {', '.join(carried) or 'nothing'}"
 
 
-def _flows(plan: Plan, width: int) -> list[str]:
-    rows = []
-    names = {node.key: node.full_name for node in plan.nodes}
+def _flows(plan: Plan) -> _Rows:
     for flow in plan.flows:
-        needs = []
-        if flow.unique is not UniqueHow.NOT:
-            needs.append(f"{flow.unique.value} unique")
-        if flow.max_delay_ms is not None:
-            needs.append(f"at most {flow.max_delay_ms:g} ms")
-        needs += [str(each) for each in flow.quantities if each.name in _SHOWN]
-        if flow.measure:
-            needs.append("measured by a subscription of ours")
-        if flow.linked and not needs:
-            needs.append("linked")
-        ends = f"{names[flow.publisher]} → {names[flow.subscription]}"
         by = f"{flow.medium} ({flow.medium_reason})" if flow.medium else flow.medium_reason
-        told = filter(None, (by, ", ".join(needs)))
-        rows.append((flow.topic, ends, "; ".join(told)))
-    return columns(rows, indent=2, width=width)
+        said = [by] if by else []
+        if flow.unique is not UniqueHow.NOT:
+            said.append(f"{flow.unique.value} unique")
+        said += _numbers(flow.max_delay_ms, flow.quantities)
+        if flow.measure:
+            said.append("measured by a subscription of ours")
+        ends = [plan.node(key).full_name for key in (flow.publisher, flow.subscription)]
+        yield flow.topic, " → ".join(ends), "; ".join(said)

@@ -18,7 +18,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
 from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -31,8 +31,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import medium_of, udp_to
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.medium import udp_to
 from lifecycle.plan.discovery import (
     Hosts,
     PortPool,
@@ -43,8 +42,6 @@ from lifecycle.plan.discovery import (
 from lifecycle.plan.media import (
     DataLayerGraph,
     NegotiatedConnection,
-    Party,
-    carried,
     party_of_node,
     rmw_of,
     terms_of,
@@ -54,10 +51,8 @@ from lifecycle.plan.media import (
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
-    MAX_USER_ID,
     ParticipantConnections,
     Plan,
-    PlanError,
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
@@ -196,83 +191,12 @@ def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnecti
     return replace(node, endpoints=tuple(endpoints), participants=tuple(kept))
 
 
-_End = tuple[PlannedNode, PlannedEndpoint]
-
-
-def infeasible(
-    nodes: Sequence[PlannedNode], parties: Mapping[str, Party], *, negotiated: bool
-) -> Iterator[Diagnostic]:
-    """Yield what participants are asked for and cannot do.
-
-    Without `negotiated`, only topics on declared connections are where they will be.
-    """
-    placed = {
-        node.key: replace(parties[node.key], participants=node.participants) for node in nodes
-    }
-    yield from _services(nodes, placed)
-    for node in nodes:
-        party = placed[node.key]
-        for each in node.endpoints:
-            on = party.participant_of(each)
-            if negotiated or (on is not None and on.connection):
-                yield from _without_udp(node, each, party.transports_at(each))
-
-
-def _services(nodes: Sequence[PlannedNode], parties: Mapping[str, Party]) -> Iterator[Diagnostic]:
-    servers: dict[tuple[EndpointKind, str], list[_End]] = {}
-    for node in nodes:
-        for each in node.endpoints:
-            servers.setdefault((each.kind, each.resolved), []).append((node, each))
-    for node in nodes:
-        for each in node.endpoints:
-            if each.kind.is_topic or each.kind.offers:
-                continue
-            for other, server in servers.get((each.kind.other_end, each.resolved), ()):
-                party, serving = parties[node.key], parties[other.key]
-                mine, theirs = party.transports_at(each), serving.transports_at(server)
-                near = party.host == serving.host
-                if not mine or not theirs or carried(mine, theirs, same_host=near):
-                    continue
-                message = (
-                    f"cannot call {each.kind.meets_in} {each.resolved!r} of {other.key!r} from "
-                    f"{node.key!r}: the client's participant has {', '.join(mine)}, the server's "
-                    f"{', '.join(theirs)}, and they are on {'one host' if near else 'two hosts'}"
-                )
-                hint = "map both ends onto connections that have a transport in common"
-                yield error("plan.service-apart", each.at, message, hint)
-
-
-def _without_udp(
-    node: PlannedNode, each: PlannedEndpoint, by: tuple[str, ...]
-) -> Iterator[Diagnostic]:
-    if not by or any(medium_of(each).is_udp for each in by):
-        return
-    has = ", ".join(by)
-    if each.dscp is not None and each.enforce_dscp:
-        message = (
-            f"cannot mark {each.kind.noun} {each.name!r} of {node.key!r} {describe(each.dscp)}: "
-            f"its participant has {has}, and only UDP sockets can be marked"
-        )
-        hint = "use 'transport: udpv4', or remove the mark"
-        yield error("plan.mark-without-udp", each.at, message, hint)
-    if (
-        each.kind is EndpointKind.SUBSCRIPTION
-        and each.unique is UniqueRequirement.STRICTLY_REQUIRED
-    ):
-        message = (
-            f"cannot give subscription {each.name!r} of {node.key!r} a port of its own: its "
-            f"participant has {has}, and only UDP has one port for each subscription"
-        )
-        hint = "use 'transport: udpv4', or remove 'unique'"
-        yield error("plan.unique-without-udp", each.at, message, hint)
-
-
 def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     """Connect everything, beside declared connections and the extra participants of flows.
 
     Raises:
-        PlanError: a pair cannot be connected, a participant cannot do what is asked of it, or there
-            are not enough ports.
+        ManifestError: pairs cannot be connected.
+        PlanError: there are not enough ports.
     """
     discovery, data_layer = plan.discovery, plan.data_layer
     hosts = Hosts.of(plan)
@@ -305,14 +229,11 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
         for node in nodes
     }
     static = data_layer.source is DataLayerSource.STATIC
-    found: list[Diagnostic] = []
     if static:
         graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
-        found += _unconnectable(graph, plan, links)
+        if found := tuple(_unconnectable(graph, plan, links)):
+            raise ManifestError(found)
         plan = with_graph(plan, graph)
-    found += infeasible(plan.nodes, parties, negotiated=static)
-    if found:
-        raise PlanError.of(tuple(found))
     may_use_tcp = not static and _may_use_tcp(plan)
     observers = connect_observers(plan, hosts, own, may_use_tcp=may_use_tcp)
     return replace(plan, observers=_by_machine(observers, hosts))
@@ -390,7 +311,7 @@ def place_static(
     A participant that makes a publisher's flow unique becomes a connection as well.
 
     Raises:
-        PlanError: too few ports, or more endpoints than there are ids.
+        PlanError: too few ports.
     """
     placed = [_place(node) for node in nodes]
     kind = udp_to("".join(hosts.used))
@@ -461,13 +382,6 @@ def _table(nodes: Sequence[PlannedNode]) -> Iterator[StaticParticipant]:
             lines = []
             for entry in (*(_line(each) for each in carried), *_GRAPH):
                 number += 1
-                if number > MAX_USER_ID:
-                    raise PlanError(
-                        f"cannot number more than {MAX_USER_ID} endpoints, which Fast DDS's static "
-                        "endpoint discovery allows",
-                        hint="use 'discovery: {mode: static}'",
-                        at=node.at,
-                    )
                 lines.append(replace(entry, user_id=number))
             yield StaticParticipant(name=_enclave(node, participant), endpoints=tuple(lines))
 

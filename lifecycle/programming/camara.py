@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import datetime as dt
-import json
 import math
 import re
+import time
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -14,10 +15,15 @@ from msgspec.structs import replace
 from lifecycle.programming.http import ID_PATTERN, ServerSettings, is_gone, read_answer, text_of
 from lifecycle.programming.ledger import Entry
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
+from lifecycle.programming.server import (
+    Body,
+    DeviceEnd,
+    Made,
+    ServerTarget,
+    class_name,
+    steady_s,
+)
 from lifecycle.programming.target import HttpError, PartlyError, each_done
-
-_COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
 
 _MARGIN = 0.2
 """A session is prolonged when this part of what was asked for is left, …"""
@@ -25,10 +31,10 @@ _MARGIN = 0.2
 _MARGIN_S = (5.0, 300.0)
 """… but at least and at most so many seconds before it expires."""
 
-_POLL_S = 0.25
+_ENDS = ("applicationServer", "devicePorts", "applicationServerPorts")
 
-_SETTLED_S = 10.0
-"""How long a session may take to become available."""
+_POLLS_S = (0.25, 0.5, 1.0, 2.0, 2.0, 2.0, 2.0)
+"""Between looks at a session that is to become available."""
 
 _LONGEST_S = 2**31 - 1
 """Largest `duration`, an int32."""
@@ -58,7 +64,7 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
             raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
 
 
-class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """SessionInfo of QualityOnDemand 1.1.0, as far as it is read; None is not shown."""
 
     session_id: Annotated[str, msgspec.Meta(pattern=ID_PATTERN)]
@@ -69,12 +75,6 @@ class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_d
     application_server: Any = None
     device_ports: Any = None
     application_server_ports: Any = None
-    qos_profile: Any = None
-
-    @property
-    def why(self) -> str:
-        """Why it ended."""
-        return text_of(self.status_info) or "no reason given"
 
 
 class CamaraTarget(ServerTarget):
@@ -104,74 +104,73 @@ class CamaraTarget(ServerTarget):
             "duration": self._server.duration_s,
         }
 
-    def create(self, body: Body) -> Made:
-        """POST it and wait a little until it is available.
-
-        Raises:
-            HttpError: refused, or the network cannot provide it.
-        """
-        reply = self._api.request("POST", self.collection, body)
+    async def create(self, body: Body) -> Made:
+        """POST it and wait a little until it is available."""
+        reply = await self._api.request("POST", self.collection, body)
         session = read_answer(reply, _Session)
         id_ = session.session_id
         try:
-            session = self._settled(session)
-            if session.qos_status != "UNAVAILABLE":
-                return self._made(session, body)
-            self.delete(id_)
+            for pause_s in _POLLS_S:
+                if session.qos_status != "REQUESTED":
+                    break
+                await asyncio.sleep(pause_s)
+                session = read_answer(await self._api.request("GET", self.path(id_)), _Session)
+            if session.qos_status == "UNAVAILABLE":
+                await self.delete(id_)
         except HttpError as error:
             error.uncertain = True  # it was made, whatever became of asking for its state
             raise
-        raise HttpError(
-            f"cannot get this QoS: the network made session {id_} unavailable ({session.why})",
-            status=reply.status_code,
-        )
+        if session.qos_status == "UNAVAILABLE":
+            why = text_of(session.status_info) or "no reason given"
+            raise HttpError(
+                f"cannot get this QoS: the network made session {id_} unavailable ({why})",
+                status=reply.status_code,
+            )
+        return self._made(session)
 
-    def look(self, id_: str, body: Body) -> Made | None:
-        """GET it, or all of the device; one that has ended differs, for it is deleted first."""
-        if id_:
-            reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-            return None if is_gone(reply) else self._made(read_answer(reply, _Session), body)
+    async def look(self, body: Body) -> str:
+        """Ask for all of the device."""
         asked = {"device": body["device"]}
-        reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
-        for each in () if is_gone(reply) else read_answer(reply, tuple[_Session, ...]):
-            if not differs(body, each, _COMPARED, missing=True):
-                return self._made(each, body)
-        return None
+        reply = await self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
+        for each in () if is_gone(reply) else read_answer(reply, list[_Session]):
+            ends = (each.application_server, each.device_ports, each.application_server_ports)
+            if ends == tuple(map(body.get, _ENDS)):
+                return each.session_id
+        return ""
 
-    def renew(self) -> float | None:
+    async def renew(self) -> float | None:
         """Prolong sessions that are due; return seconds until the next is.
 
         Raises:
             PartlyError: something could not be prolonged and will expire or has expired.
         """
         now = [each for each in self._entries().values() if each.id and self._due_in_s(each) <= 0]
-        _, failed = each_done(now, self._prolong)
+        _, failed = await each_done(now, self._prolong)
         if failed:
             errors = [(entry.key, error) for entry, error in failed]
             raise PartlyError(self.name, len(self._entries()), errors)
         due_s = min(map(self._due_in_s, self._entries().values()), default=math.inf)
         return None if due_s == math.inf else due_s
 
-    def _prolong(self, entry: Entry) -> None:
+    async def _prolong(self, entry: Entry) -> None:
         """Extend a session; make a new one where it cannot be extended any further."""
-        body, made = json.loads(entry.body), None
+        path = f"{self.path(entry.id)}/extend"
+        body = {"requestedAdditionalDuration": self._server.duration_s}
+        made = None
         try:
-            reply = self._api.request(
-                "POST",
-                f"{self.path(entry.id)}/extend",
-                {"requestedAdditionalDuration": self._server.duration_s},
-                may_be_gone=True,
-            )
+            reply = await self._api.request("POST", path, body, may_be_gone=True)
         except HttpError as error:
             # Not in a state to be extended, or over the profile's limit.
             if error.status not in (400, 409):
                 raise
         else:
             if not is_gone(reply):
-                made = self._made(read_answer(reply, _Session), body)
+                made = self._made(read_answer(reply, _Session))
         if made is None or (made.expires_s or 0.0) <= (entry.expires_s or 0.0) + 1:
-            made = self.update(entry.id, body, body)
-        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
+            await self.delete(entry.id)
+            await self._create(replace(entry, id="", expires_s=None))
+        else:
+            self._note(entry.key, replace(entry, expires_s=made.expires_s))
 
     def _due_in_s(self, entry: Entry) -> float:
         """Return seconds until a session must be prolonged; negative once it is late."""
@@ -179,39 +178,19 @@ class CamaraTarget(ServerTarget):
             return math.inf
         least, most = _MARGIN_S
         margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
-        return entry.expires_s - self._api.patience.steady_s() - margin_s
+        return entry.expires_s - steady_s() - margin_s
 
-    def _settled(self, session: _Session) -> _Session:
-        """Ask until the session is more than requested, for a while."""
-        wait_s = _POLL_S
-        deadline_s = self._api.patience.steady_s() + _SETTLED_S
-        path = self.path(session.session_id)
-        while session.qos_status == "REQUESTED":
-            left_s = deadline_s - self._api.patience.steady_s()
-            if left_s <= 0:
-                break
-            self._api.pause(min(wait_s, left_s))
-            wait_s *= 2
-            session = read_answer(self._api.request("GET", path), _Session)
-        return session
-
-    def _made(self, session: _Session, body: Body) -> Made:
-        id_, granted = session.session_id, session.duration
-        if session.qos_status == "UNAVAILABLE":
-            return Made(id=id_, differs=f"it ended: {session.why}")
+    def _made(self, session: _Session) -> Made:
+        granted = session.duration
         detail = "requested, not yet available" if session.qos_status == "REQUESTED" else ""
         if granted is not None and granted < self._server.duration_s:
             detail = f"granted for {granted} s instead of {self._server.duration_s} s"
         # The latest that it can end, if nothing says when.
         left_s: float | None = granted
         if session.expires_at is not None:
-            left_s = session.expires_at.timestamp() - self._api.patience.now_s()
-        return Made(
-            id=id_,
-            expires_s=None if left_s is None else self._api.patience.steady_s() + left_s,
-            detail=detail,
-            differs=differs(body, session, _COMPARED),
-        )
+            left_s = session.expires_at.timestamp() - time.time()
+        expires_s = None if left_s is None else steady_s() + left_s
+        return Made(id=session.session_id, expires_s=expires_s, detail=detail)
 
 
 TARGET = CamaraTarget

@@ -1,25 +1,23 @@
 """What targets on this host have in common: nft and tc are run, and nftables tables of ours kept.
 
 A table is replaced as a whole in one transaction, so no foreign object is ever touched; its comment
-says that it is ours. The ledger has what was written for each flow, and a digest of what nft showed
-afterwards: what differs from that was changed by others. Needs nftables 1.0.6 or later.
+says that it is ours. The ledger has what was written for each flow. Needs nftables 1.0.6 or later.
 """
 
 from __future__ import annotations
 
 import abc
-import hashlib
+import asyncio
 import os
 import re
 import shlex
 import subprocess
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
-import msgspec
 from msgspec.structs import replace
 
-from lifecycle.codec import from_json
 from lifecycle.errors import UsageError
 from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.ledger import Entry, TargetRecord
@@ -50,9 +48,12 @@ _NO_PRIVILEGE = re.compile(r"operation not permitted|permission denied|must be r
 Output = subprocess.CompletedProcess[str]
 """What a program left."""
 
+_THREAD = ThreadPoolExecutor(1, thread_name_prefix="networks")
+"""One program after the other: what was cancelled has ended before the next begins."""
+
 
 class HostTool:
-    """Programs of this host.
+    """Programs of this host, which hold up no loop.
 
     Args:
         prefix: arguments before each command line, such as `ip netns exec robot`.
@@ -61,12 +62,19 @@ class HostTool:
     def __init__(self, prefix: Sequence[str] = ()) -> None:
         self._prefix = tuple(prefix)
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    async def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         """Run a program to its end and return what it left, whatever its exit code.
 
         Raises:
             ProgrammingError: it is not installed, or does not end.
         """
+        try:
+            running = _THREAD.submit(self._run, argv, stdin)
+        except RuntimeError:  # there is no room for a thread any more
+            return self._run(argv, stdin)
+        return await asyncio.wrap_future(running)
+
+    def _run(self, argv: Sequence[str], stdin: str) -> Output:
         # Distributions keep these in sbin, which is not on every user's path.
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         try:
@@ -96,42 +104,16 @@ class HostTool:
             raise ProgrammingError(f"cannot run {shlex.join(argv)!r}: {error.strerror}") from error
 
 
-def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
+async def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
     """Run a program that has to succeed and return what it printed; else it cannot do `doing`.
 
     Raises:
         ProgrammingError: see `failure`.
     """
-    output = tool.run(argv, stdin=stdin)
+    output = await tool.run(argv, stdin=stdin)
     if output.returncode == 0:
         return output.stdout
     raise failure(output, argv, doing=doing)
-
-
-class Qdisc(msgspec.Struct, frozen=True, kw_only=True):
-    """What is read of a queueing discipline in the list of `tc -j qdisc show`."""
-
-    kind: str
-    dev: str = ""
-    handle: str = "0:"
-    root: bool = False
-
-
-def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
-    """Return the queueing disciplines that `tc -j qdisc show` lists.
-
-    Raises:
-        ProgrammingError: it failed, or what it prints is no such list.
-    """
-    argv = ("tc", "-j", "qdisc", "show", *options)
-    text = demand(tool, argv, doing=doing)
-    try:
-        return from_json(text.strip() or "[]", tuple[Qdisc, ...])
-    except ValueError as error:
-        raise ProgrammingError(
-            f"cannot {doing}: what {shlex.join(argv)!r} prints is no list of qdiscs: {error}",
-            hint="look at what it prints, and which program that is",
-        ) from error
 
 
 def failure(output: Output, argv: Sequence[str], *, doing: str) -> ProgrammingError:
@@ -237,12 +219,7 @@ class TableTarget(Target):
     Args:
         means: their ledger says what was written, for who compares or removes it later.
         scope: names it in the ledger.
-
-    Attributes:
-        gone: detail of a change because what was written is not there any more.
     """
-
-    gone: ClassVar[str] = "the table was gone"
 
     def __init__(
         self, settings: Any, means: Means, tool: HostTool | None, *, table: str, scope: str
@@ -272,49 +249,53 @@ class TableTarget(Target):
     def script(self, wanted: Wanted, remarks: Sequence[str]) -> str:
         """Return the same as a file for people, with these lines of comments."""
 
-    def found(self) -> str:
-        """Return what is there of ours, as the host shows it; empty if nothing is.
+    async def found(self) -> bool:
+        """Whether what was written is there.
 
         Raises:
             ProgrammingError: an object of this name is not ours, or may not be read.
         """
-        return self.listing()
+        return await self.has_table()
 
-    def write(self, wanted: Wanted, *, anew: bool) -> None:  # noqa: ARG002 - for what is beside it
+    async def has_begun(self) -> bool:
+        """Whether the first of what is written is there."""
+        return await self.has_table()
+
+    async def write(self, wanted: Wanted, *, anew: bool) -> None:  # noqa: ARG002 - for what is beside it
         """Write it; `anew` if nothing of it is there, or what is beside the table changes."""
-        self.write_table(wanted.table)
+        await self.write_table(wanted.table)
 
-    def clear(self) -> bool:
+    async def clear(self) -> bool:
         """Remove what is there of ours; return whether there was anything."""
-        there = bool(self.listing())
+        there = await self.has_table()
         if there:
-            self.write_table(render_table_removal(self._table))
+            await self.write_table(render_table_removal(self._table))
         return there
 
-    def listing(self) -> str:
-        """Return the table as nft shows it, without counts; empty if there is none.
+    async def has_table(self) -> bool:
+        """Whether there is our table.
 
         Raises:
             ProgrammingError: a table of this name is not ours, or may not be read.
         """
-        argv = ["nft", "-s", "list", "table", "inet", self._table]
+        argv = ["nft", "list", "table", "inet", self._table]
         table = f"nft table inet {self._table}"
-        output = self._tool.run(argv)
+        output = await self._tool.run(argv)
         if output.returncode != 0:
             if _NONE_SUCH.search(output.stderr):
-                return ""
+                return False
             raise failure(output, argv, doing=f"read {table}")
         if _MANAGED not in output.stdout:
             raise ProgrammingError(
                 f"cannot use {table}: it exists and is not marked as managed by lifecycle",
                 hint=f"look at it: nft list table inet {self._table}",
             )
-        return output.stdout
+        return True
 
-    def write_table(self, text: str) -> None:
+    async def write_table(self, text: str) -> None:
         """Have nft take a ruleset, whole or not at all."""
         doing = f"write nft table inet {self._table}"
-        demand(self._tool, ["nft", "-f", "-"], doing=doing, stdin=text)
+        await demand(self._tool, ["nft", "-f", "-"], doing=doing, stdin=text)
 
     def export(self, rules: RuleSet) -> str:
         """Return a file that programs a host, and says in comments what is left out of it."""
@@ -323,15 +304,15 @@ class TableTarget(Target):
         remarks += [f"# left out: {each}" for each in (*rules.left_out, *left_out)]
         return self.script(self.wanted(placed), remarks)
 
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Compare what was written, and what is there, with the rules.
+    async def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Compare what was written, and whether it is there, with the rules.
 
         Raises:
             ProgrammingError: what is there is not ours, or may not be read.
         """
-        return self.apply(rules, write=False)
+        return await self.apply(rules, write=False)
 
-    def apply(self, rules: Sequence[FlowRule], *, write: bool = True) -> TargetChanges:
+    async def apply(self, rules: Sequence[FlowRule], *, write: bool = True) -> TargetChanges:
         """Write it if anything differs, unless it is only to be compared.
 
         Raises:
@@ -347,52 +328,48 @@ class TableTarget(Target):
             for rule, lines in placed
         )
         if write and not entries:
-            return replace(self.remove(), left_out=left_out)
-        record = replace(self._record, entries=entries, beside=_digest(wanted.beside))
-        known, found = self._ledger.find(record), self.found()
-        anew = known is None or not found or known.beside != record.beside
+            return replace(await self.remove(), left_out=left_out)
+        known, is_there = self._ledger.find(self._record), await self.found()
+        anew = known is None or not is_there or known.beside != wanted.beside
         detail = ""
-        if known is not None and not found:
-            detail = self.gone
-        elif known is not None and anew:
-            detail = "the classes change"
-        elif known is not None and known.found != _digest(found):
-            detail = "the table is not as it was written"
-        before = {each.key: each for each in known.entries} if known and found else {}
+        if known is not None and anew:
+            detail = "the classes change" if is_there else "it was gone"
+        before = {each.key: each for each in known.entries} if known and is_there else {}
         changes = [_change(each, before.pop(each.key, None), detail) for each in entries]
         changes += [FlowChange(kind=ChangeKind.DELETE, key=key) for key in before]
         done = TargetChanges(target=self.name, changes=tuple(changes), left_out=left_out)
         if write and done.pending:
-            self._write_down(record, wanted, anew=anew)
+            await self._write_down(entries, wanted, anew=anew)
         return done
 
-    def remove(self) -> TargetChanges:
+    async def remove(self) -> TargetChanges:
         """Delete what the ledger says is there, if it still is."""
         known = self._ledger.find(self._record)
         if known is None:
             return TargetChanges(target=self.name)
-        there = self.clear()
+        there = await self.clear()
         self._ledger.put(self._record)
         gone = [FlowChange(kind=ChangeKind.DELETE, key=each.key) for each in known.entries]
         return TargetChanges(target=self.name, changes=tuple(gone) if there else ())
 
-    def _write_down(self, record: TargetRecord, wanted: Wanted, *, anew: bool) -> None:
+    async def _write_down(self, entries: tuple[Entry, ...], wanted: Wanted, *, anew: bool) -> None:
         """Write it, and in the ledger before and after."""
-        nothing_before = self._ledger.find(record) is None
-        # First without digests: what a crash in between leaves is made anew.
-        self._ledger.put(replace(record, beside=""))
+        nothing_before = self._ledger.find(self._record) is None
+        # First without what is written: what a crash in between leaves is written anew.
+        begun = tuple(replace(each, body="") for each in entries)
+        self._ledger.put(replace(self._record, entries=begun))
         try:
-            self.write(wanted, anew=anew)
-            self._ledger.put(replace(record, found=_digest(self.found())))
+            await self.write(wanted, anew=anew)
         except ProgrammingError as error:
             try:
-                if not nothing_before or self.found():
-                    self.clear()
+                if not nothing_before or await self.has_begun():
+                    await self.clear()
             except ProgrammingError as left:
                 message = f"{error.message}; what was made is left: {left}"
                 raise ProgrammingError(message, hint=error.hint) from error
             self._ledger.put(self._record)
             raise
+        self._ledger.put(replace(self._record, entries=entries, beside=wanted.beside))
 
 
 def _change(wanted: Entry, before: Entry | None, detail: str) -> FlowChange:
@@ -400,7 +377,3 @@ def _change(wanted: Entry, before: Entry | None, detail: str) -> FlowChange:
     if before is not None and before.body == wanted.body and not detail:
         kind = ChangeKind.KEEP
     return FlowChange(kind=kind, key=wanted.key, what=wanted.what, detail=detail)
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest() if text else ""

@@ -7,7 +7,7 @@ names the request and the field.
 
 from __future__ import annotations
 
-import email.utils
+import asyncio
 import ipaddress
 import os
 import re
@@ -22,14 +22,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming import TARGETS
-from lifecycle.programming.target import (
-    HttpError,
-    Means,
-    ProgrammingError,
-    SettingsError,
-    target_kind,
-)
+from lifecycle.programming.target import HttpError, Means, ProgrammingError, SettingsError
 from lifecycle.run_directory import read_regular
 
 try:
@@ -145,19 +138,16 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return self.url.rstrip("/")
 
 
-def load_settings(path: str | Path) -> dict[str, ServerSettings]:
-    """Read a settings file, YAML or JSON.
+_S = TypeVar("_S", bound=ServerSettings)
 
-    Returns:
-        By the names of their targets, those that the file has.
+
+def load_settings(path: str | Path, key: str, type_: type[_S]) -> _S | None:
+    """Read what a settings file, YAML or JSON, has of one target; None if nothing.
 
     Raises:
         SettingsError: it cannot be read, or a key or value is not allowed; says which.
     """
-    types = {name: target_kind(name).settings_type for name in TARGETS}
     file = Path(path)
-    keys = [(name, type_ | None, None) for name, type_ in types.items() if type_ is not None]
-    file_type = msgspec.defstruct("Settings", keys, frozen=True, forbid_unknown_fields=True)
     try:
         data = read_regular(file, _MAX_BYTES + 1)
     except OSError as error:
@@ -166,46 +156,42 @@ def load_settings(path: str | Path) -> dict[str, ServerSettings]:
         raise SettingsError(f"cannot read settings {str(path)!r}: larger than {_MAX_BYTES} bytes")
     try:
         # JSON is YAML, and the keys of a JSON object are converted like those of YAML.
-        plain = yaml.safe_load(data)
-        found = msgspec.convert(plain, file_type, strict=False)
-    except yaml.YAMLError as error:
+        found = msgspec.convert(yaml.safe_load(data), dict[str, Any], strict=False).get(key)
+        settings = msgspec.convert(found, type_ | None, strict=False)
+    except msgspec.ValidationError as error:
+        text = readable(error, key)
+        raise SettingsError(f"cannot use settings {str(path)!r}: {text}") from error
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         # Only where: the library's own text quotes the line, which may hold a pasted token.
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" at line {mark.line + 1}, column {mark.column + 1}"
         raise SettingsError(f"cannot read settings {str(path)!r}: no YAML{where}") from None
-    except msgspec.ValidationError as error:
-        raise SettingsError(f"cannot use settings {str(path)!r}: {readable(error)}") from error
-    except (ValueError, OverflowError, RecursionError):
-        # Dates and numbers that are none, and what is nested deeper than Python goes.
-        raise SettingsError(
-            f"cannot read settings {str(path)!r}: it is nested too deep, or has a number or date "
-            "that is none"
-        ) from None
-    servers = {name: each for name in types if (each := getattr(found, name, None)) is not None}
-    for name, each in servers.items():
-        if each.token is not None and each.token.file:
-            token = Token(file=str(file.absolute().parent / each.token.file))
-            servers[name] = replace(each, token=token)
-    return servers
+    if settings is None or settings.token is None or not settings.token.file:
+        return settings
+    token = Token(file=str(file.absolute().parent / settings.token.file))
+    return replace(settings, token=token)
 
 
-def readable(error: Exception) -> str:
-    """Return msgspec's message with the path of the value in front, as we write paths."""
+def readable(error: Exception, root: str = "") -> str:
+    """Return msgspec's message with the path of the value in front, below `root`."""
     text, separator, where = str(error).rpartition(" - at `")
     if not separator:
-        return str(error)
+        return f"{root}: {error}" if root else str(error)
     whose, _, path = where.strip("`").rpartition("` in `")
-    return f"{'a key of ' if whose else ''}{path.lstrip('$.')}: {text}"
+    path = path.replace("$", root, 1).lstrip(".")
+    return f"{'a key of ' if whose else ''}{path}: {text}"
 
 
 ID_PATTERN = r"^[!-~]{1,512}$"
 """The id of a subscription or a session; CAMARA's are UUIDs."""
 
-_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE"})
-"""RFC 9110 §9.2.2."""
+_AGAIN = frozenset({409, 429, 503})
+"""In the way of 409 may be what a server still deletes; the others ask to wait."""
 
-_ALWAYS_AGAIN = frozenset({409, 429, 503})
-_PASSING = frozenset({500, 502, 504})
+_PAUSES_S = (0.5, 1.0, 2.0, 4.0)
+"""Before a request is sent again, unless the server says how long."""
+
+_LONGEST_PAUSE_S = 60.0
 _MAX_QUOTED = 300
 _LARGEST_ANSWER = 4 * 1024 * 1024
 """Bytes: answers are a session or a subscription each, and a list of them all when one was lost."""
@@ -281,11 +267,9 @@ class Api:
 
     Attributes:
         url: what every path is appended to.
-        patience: with it.
 
     Raises:
         ProgrammingError: httpx, the extra `networks`, is not installed.
-        SettingsError: a proxy that the environment names cannot be used.
     """
 
     def __init__(self, settings: ServerSettings, means: Means) -> None:
@@ -295,43 +279,12 @@ class Api:
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
-        self._is_local = settings.is_local
         self._token = settings.token
         self._timeout_s = settings.timeout_s
-        self.patience = means.patience
+        self._means = means
         self._certificates = httpx.create_ssl_context()
-        self._client()  # so that a proxy that cannot be used is an error at once
 
-    def _client(self) -> httpx.AsyncClient:
-        try:
-            return httpx.AsyncClient(
-                # A redirect could carry the token elsewhere, so none is followed.
-                follow_redirects=False,
-                timeout=None,  # an attempt is bounded as a whole
-                verify=self._certificates,
-                # What is for this host goes to no proxy: it would read the token, and cannot even
-                # reach what it is for.
-                trust_env=not self._is_local,
-            )
-        except (ValueError, ImportError, httpx.InvalidURL):
-            # Not quoted: it may hold a password.
-            raise SettingsError(
-                f"cannot reach {self.url} through the proxy that the environment names: it is not "
-                "http:// or https:// with a host",
-                hint="see HTTPS_PROXY, HTTP_PROXY, ALL_PROXY and NO_PROXY",
-            ) from None
-
-    def pause(self, seconds: float) -> None:
-        """Wait, unless the deadline comes first or is cancelled.
-
-        Raises:
-            HttpError: it does.
-        """
-        if seconds > self.patience.left_s():
-            raise HttpError(f"cannot wait for {self.url}: {self._why_late()}", uncertain=True)
-        self.patience.sleep(seconds)
-
-    def request(
+    async def request(
         self,
         method: str,
         path: str,
@@ -339,56 +292,47 @@ class Api:
         *,
         may_be_gone: bool = False,
     ) -> httpx.Response:
-        """Ask, and ask again where that is right; always back by the deadline.
+        """Ask, and again after 409, 429 and 503, after Retry-After if the server says it.
 
-        429 and 503 are asked again after Retry-After; 409 too, because a server may still be
-        deleting what is in the way; other server errors and lost answers only where asking twice
-        is the same as asking once. A connection that could not be made is tried again. 404 and 410
-        are answers where it `may_be_gone`.
+        404 and 410 are answers where it `may_be_gone`.
 
         Raises:
-            HttpError: refused, or still not done after all patience.
+            HttpError: refused, or not answered in time.
+        """
+        for pause_s in (*_PAUSES_S, None):
+            reply = await self._attempt(method, path, body)
+            if reply.is_success or (may_be_gone and is_gone(reply)):
+                break
+            refusal = self._refusal(reply)
+            if reply.status_code not in _AGAIN or pause_s is None:
+                raise refusal
+            after = reply.headers.get("retry-after", "").strip()
+            wait_s = float(after[:9]) if after.isascii() and after.isdigit() else pause_s
+            left_s = min(_LONGEST_PAUSE_S, self._means.left_s())
+            if wait_s > left_s:
+                refusal.hint = f"it is to be asked again in {wait_s:g} s, not within {left_s:.0f} s"
+                raise refusal
+            await asyncio.sleep(wait_s)
+        return reply
+
+    async def _attempt(
+        self, method: str, path: str, body: Mapping[str, object] | None
+    ) -> httpx.Response:
+        """Ask once.
+
+        Raises:
+            HttpError: there is no answer that can be read.
         """
         headers = {
             "accept": "application/json, application/problem+json",
             # A few bytes packed well may be as many gigabytes unpacked.
             "accept-encoding": "identity",
-            **({} if body is None else {"content-type": "application/json"}),
         }
-        content = None if body is None else to_json(body)
-        request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
-        wait_s, attempt = self.patience.first_s, 1
-        with self.patience.within(self.patience.total_s):
-            while True:
-                try:
-                    return self._attempt(request, may_be_gone=may_be_gone)
-                except HttpError as error:
-                    pause_s = min(wait_s, self.patience.longest_s)
-                    pause_s = pause_s if error.after_s is None else error.after_s
-                    left_s = self.patience.left_s()
-                    if not error.again or attempt == self.patience.attempts:
-                        raise
-                    if pause_s >= left_s:
-                        # What has failed says more than that there is no time to try again.
-                        if error.after_s is not None:
-                            error.hint = (
-                                f"the server asks to wait {pause_s:g} s, more than the "
-                                f"{left_s:.0f} s that this waits for; try again then"
-                            )
-                        raise
-                self.pause(pause_s)
-                wait_s, attempt = wait_s * 2, attempt + 1
-
-    def _attempt(self, request: httpx.Request, *, may_be_gone: bool) -> httpx.Response:
-        """Ask once.
-
-        Raises:
-            HttpError: refused, or there is no answer that can be read; says whether to ask again.
-        """
-        what = _asked(request)
-        limit_s = min(self._timeout_s, self.patience.left_s())
-        if limit_s <= 0:
-            raise HttpError(f"cannot {what}: {self._why_late()}")
+        # Revealed for this attempt only: a token that is changed meanwhile is taken up.
+        if self._token is not None:
+            headers["authorization"] = f"Bearer {self._token.reveal()}"
+        if body is not None:
+            headers["content-type"] = "application/json"
         sent = False
 
         async def trace(event: str, _: Mapping[str, Any]) -> None:
@@ -396,37 +340,37 @@ class Api:
             nonlocal sent
             sent = sent or event.endswith("send_request_headers.started")
 
-        request.extensions = {"trace": trace}
-        # Revealed for this attempt only: a token that is changed meanwhile is taken up.
-        if self._token is not None:
-            request.headers["authorization"] = f"Bearer {self._token.reveal()}"
+        request = httpx.Request(
+            method,
+            f"{self.url}{path}",
+            headers=headers,
+            content=None if body is None else to_json(body),
+            extensions={"trace": trace},
+        )
+        limit_s = min(self._timeout_s, self._means.left_s())
         try:
-            reply = self.patience.run(self._ask(request), limit_s)
-        except TimeoutError:
-            reason = f"no {'whole answer' if sent else 'connection'} in time"
-            if self.patience.cancelled.is_set():
-                reason = self._why_late()
-            reason = f"{reason} ({limit_s:.3g} s)"
+            return await asyncio.wait_for(self._answer(request), limit_s)
+        except (TimeoutError, asyncio.TimeoutError):
+            reason = f"no {'whole answer' if sent else 'connection'} in time ({limit_s:.3g} s)"
         except httpx.TransportError as error:
             reason = _why(error)
         except Exception as error:  # noqa: BLE001 - whatever a library makes of unexpected bytes
             # Never its own message, which may quote the request.
             reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
-        else:
-            if reply.is_success or (may_be_gone and is_gone(reply)):
-                return reply
-            raise self._refusal(reply)
-        again = request.method in _IDEMPOTENT or not sent
-        raise HttpError(f"cannot {what}: {reason}", uncertain=sent, again=again)
+        raise HttpError(f"cannot {_asked(request)}: {reason}", uncertain=sent)
 
-    async def _ask(self, request: httpx.Request) -> httpx.Response:
+    async def _answer(self, request: httpx.Request) -> httpx.Response:
         """Send a request and read its answer, of which no more than can be of use.
 
         Raises:
             httpx.HTTPError: there is none, or it is packed.
         """
         body = bytearray()
-        async with self._client() as client:
+        # No redirect and no proxy: either could carry the token elsewhere.
+        client = httpx.AsyncClient(
+            follow_redirects=False, timeout=None, verify=self._certificates, trust_env=False
+        )
+        async with client:
             answer = await client.send(request, stream=True)
             try:
                 coding = answer.headers.get("content-encoding", "identity")
@@ -446,10 +390,6 @@ class Api:
             extensions=answer.extensions,
         )
 
-    def _why_late(self) -> str:
-        ended = self.patience.cancelled.is_set()
-        return "it was ended before it was done" if ended else "no time left"
-
     def _refusal(self, answer: httpx.Response) -> HttpError:
         status = answer.status_code
         try:
@@ -467,14 +407,11 @@ class Api:
             first(found.cause, found.code),
             first(found.detail, found.message, found.title),
         ]
-        lost, twice = status in _PASSING, answer.request.method in _IDEMPOTENT
         forbidden = status in (401, 403)
         return HttpError(
             f"cannot {_asked(answer.request)}: {': '.join(filter(None, words))}",
             status=status,
-            uncertain=lost and not twice,
-            again=status in _ALWAYS_AGAIN or (lost and twice),
-            after_s=_retry_after_s(answer.headers.get("retry-after", ""), self.patience.now_s()),
+            uncertain=status >= 500 and status not in _AGAIN,
             hint="check the token and what it is allowed to do" if forbidden else "",
         )
 
@@ -491,18 +428,6 @@ def text_of(value: object, secret: str = "") -> str:
         value = value.replace(secret, "***")
     plain = "".join(each if each.isprintable() else " " for each in value)
     return plain[:_MAX_QUOTED].strip()
-
-
-def _retry_after_s(text: str, now_s: float) -> float | None:
-    """Retry-After as seconds from now (RFC 9110 §10.2.3); None if there is none to be read."""
-    text = text.strip()
-    if text.isascii() and text.isdigit():
-        return float(text[:9])
-    try:
-        ends_s = email.utils.parsedate_to_datetime(text).timestamp()
-    except (ValueError, TypeError, IndexError, OverflowError, OSError):  # whatever is no date
-        return None
-    return max(0.0, ends_s - now_s)
 
 
 def _why(error: httpx.TransportError) -> str:

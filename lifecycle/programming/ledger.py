@@ -6,11 +6,12 @@ what is ours, and the next run finds what a dead one left. It never has a creden
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import msgspec
@@ -42,7 +43,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
         id: what a server calls it, a subscription or a session; empty while it was asked for and
             is not known to be made.
         what: for people.
-        expires_s: on the clock of Patience.steady_s; None if it does not expire.
+        expires_s: on the clock of `server.steady_s`; None if it does not expire.
         body: what was written or asked for, of servers as JSON: it finds again what has no id yet.
     """
 
@@ -61,15 +62,13 @@ class TargetRecord(msgspec.Struct, frozen=True, kw_only=True):
         scope: which one of that kind: a table, a device, a URL.
         settings: path of the settings file that says how to get there; empty if none is needed.
         entries: nothing of ours is there without any.
-        found: digest of a host's table as it was after writing; empty while it is written.
-        beside: digest of what was made beside that table.
+        beside: what was made beside the table of a host; empty while it is written.
     """
 
     target: str
     scope: str
     settings: str = ""
     entries: tuple[Entry, ...] = ()
-    found: str = ""
     beside: str = ""
 
     @property
@@ -107,8 +106,8 @@ class Ledger:
         self.system = system
         self._owned = owned
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    @contextlib.asynccontextmanager
+    async def locked(self) -> AsyncIterator[None]:
         """Keep other processes out, such as `flows apply` beside `up`; does not nest.
 
         Raises:
@@ -130,7 +129,7 @@ class Ledger:
                         f"doing so for {_LOCK_S:g} s",
                         hint="wait for it, or end it",
                     )
-                time.sleep(_LOCK_CHECK_S)
+                await asyncio.sleep(_LOCK_CHECK_S)
             yield
 
     def read(self) -> LedgerFile:

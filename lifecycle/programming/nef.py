@@ -5,29 +5,19 @@ By TS 29.122 (release 17, API version 1.2.3); its schema does not look inside fi
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 import re
-from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec import to_builtins
-from msgspec.structs import replace
 
 from lifecycle.programming import http
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name, differs
-
-if TYPE_CHECKING:
-    import httpx
-
-_FIXED = ("ueIpv4Addr", "ueIpv6Addr")
-"""What no PUT may change: another device needs another subscription."""
-
-_COMPARED = (*_FIXED, "qosReference", "notificationDestination", "flowInfo")
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
 
 _PROTOCOLS = {"udp": "17", "tcp": "6"}
 """IANA Assigned Internet Protocol Numbers."""
+
+_FILTER = re.compile(r"permit +(in|out) .*from +(\S+) +(\S+) +to +(\S+) +(\S+)")
+"""IPFilterRule text; its protocol may be a number or a name."""
 
 
 class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -38,13 +28,11 @@ class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown
         scs_as_id: who we are to the operator.
         notification_destination: http or https URL that the network reports to.
         qos_references: the operator's names of classes, by 5QI.
-        protocol_by_name: write `udp` instead of `17`, as some servers want it.
     """
 
     scs_as_id: str
     notification_destination: str
     qos_references: dict[int, str] = msgspec.field(default_factory=dict)
-    protocol_by_name: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,23 +52,13 @@ class NefSettings(http.ServerSettings, frozen=True, kw_only=True, forbid_unknown
         return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{self.scs_as_id}"
 
 
-def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
+def _filter(rule: FlowRule, end: DeviceEnd) -> str:
     """Return IPFilterRule text (RFC 6733 §4.3.1) in the shape of 3GPP TS 29.214 §5.3.8."""
     device, server = f"{end.device} {end.device_port}", f"{end.server} {end.server_port}"
-    name = rule.transport_protocol.value
-    protocol = name if settings.protocol_by_name else _PROTOCOLS[name]
+    protocol = _PROTOCOLS[rule.transport_protocol.value]
     if end.sends:
         return f"permit in {protocol} from {device} to {server}"
     return f"permit out {protocol} from {server} to {device}"
-
-
-def _spelled(text: str) -> str:
-    """A filter in one spelling: servers write `17` and `udp`, and other spaces."""
-    words = [_PROTOCOLS.get(each.lower(), each) for each in text.split()]
-    for index, each in enumerate(words):
-        with contextlib.suppress(ValueError):
-            words[index] = str(ipaddress.ip_address(each))
-    return " ".join(words)
 
 
 class _Flow(msgspec.Struct, frozen=True, rename="camel"):
@@ -88,17 +66,29 @@ class _Flow(msgspec.Struct, frozen=True, rename="camel"):
 
     flow_descriptions: tuple[str, ...] = ()
 
+    @property
+    def tuples(self) -> set[tuple[str, ...]]:
+        """The direction, addresses and ports of its filters."""
+        found = map(_FILTER.match, self.flow_descriptions)
+        return {each.groups() for each in found if each}
 
-class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+
+class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """What a server shows of a subscription; None is not shown."""
 
     link: str | None = msgspec.field(default=None, name="self")
     applied_qos_ref: str | None = None
     ue_ipv4_addr: str | None = None
     ue_ipv6_addr: str | None = None
-    qos_reference: str | None = None
-    notification_destination: str | None = None
-    flow_info: tuple[_Flow, ...] | None = None
+    flow_info: tuple[_Flow, ...] = ()
+
+    def is_for(self, other: _Subscription) -> bool:
+        """Whether both are for the same flow of the same device."""
+        return (
+            (self.ue_ipv4_addr, self.ue_ipv6_addr) == (other.ue_ipv4_addr, other.ue_ipv6_addr)
+            and len(self.flow_info) == 1
+            and self.flow_info[0].tuples == other.flow_info[0].tuples
+        )
 
 
 class NefTarget(ServerTarget):
@@ -118,70 +108,31 @@ class NefTarget(ServerTarget):
             "supportedFeatures": "0",  # hexadecimal, TS 29.571: none
             "notificationDestination": self._server.notification_destination,
             "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
-            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, self._server)]}],
+            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end)]}],
             "qosReference": reference,
         }
 
-    def create(self, body: Body) -> Made:
-        """POST it.
-
-        Raises:
-            HttpError: refused, or the answer does not say what was made.
-        """
-        reply = self._api.request("POST", self.collection, body)
-        shown = _shown(reply)
+    async def create(self, body: Body) -> Made:
+        """POST it."""
+        reply = await self._api.request("POST", self.collection, body)
+        shown = _Subscription()
+        if reply.content:
+            shown = http.read_answer(reply, _Subscription)
         made = reply.headers.get("location") or shown.link
         if not made:
             raise http.unusable(reply, "it has neither a Location nor a self")
-        return Made(id=http.linked(reply, made), detail=_refused(shown))
+        granted = http.text_of(shown.applied_qos_ref)
+        detail = f"granted as {granted}" if granted else ""
+        return Made(id=http.linked(reply, made), detail=detail)
 
-    def look(self, id_: str, body: Body) -> Made | None:
-        """GET it, or all of ours."""
-        path = self.path(id_) if id_ else self.collection
-        reply = self._api.request("GET", path, may_be_gone=True)
-        if http.is_gone(reply):
-            return None
-        if id_:
-            return Made(id=id_, differs=_differs(body, _shown(reply)))
-        for each in http.read_answer(reply, tuple[_Subscription, ...]):
-            if each.link and not _differs(body, each, missing=True):
-                return Made(id=http.linked(reply, each.link))
-        return None
-
-    def update(self, id_: str, before: Body, body: Body) -> Made:
-        """PUT it, so that what the network has reserved for a flow stays reserved."""
-        if any(before.get(key) != body.get(key) for key in _FIXED):
-            return super().update(id_, before, body)
-        reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
-        if http.is_gone(reply):
-            return self.create(body)
-        return Made(id=id_, detail=_refused(_shown(reply)))
-
-
-def _shown(reply: httpx.Response) -> _Subscription:
-    """Return what an answer shows; it may be without a body.
-
-    Raises:
-        HttpError: a field is not what the interface has there.
-    """
-    return http.read_answer(reply, _Subscription) if reply.content else _Subscription()
-
-
-def _refused(subscription: _Subscription) -> str:
-    """Note it if the server granted another reference than was asked for."""
-    granted = http.text_of(subscription.applied_qos_ref)
-    return f"granted as {granted}" if granted else ""
-
-
-def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
-    def in_one_spelling(each: _Subscription) -> _Subscription:
-        if each.flow_info is None:
-            return each
-        flows = (sorted(map(_spelled, flow.flow_descriptions)) for flow in each.flow_info)
-        return replace(each, flow_info=tuple(_Flow(tuple(filters)) for filters in flows))
-
-    wanted = to_builtins(in_one_spelling(msgspec.convert(asked, _Subscription)))
-    return differs(wanted, in_one_spelling(seen), _COMPARED, missing=missing)
+    async def look(self, body: Body) -> str:
+        """GET all of ours."""
+        reply = await self._api.request("GET", self.collection, may_be_gone=True)
+        asked = msgspec.convert(body, _Subscription)
+        for each in () if http.is_gone(reply) else http.read_answer(reply, list[_Subscription]):
+            if each.link and each.is_for(asked):
+                return http.linked(reply, each.link)
+        return ""
 
 
 TARGET = NefTarget

@@ -8,18 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msgspec.structs import replace
-
 from lifecycle.network.dscp import describe
 from lifecycle.programming import host
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.rules import FlowRule
-from lifecycle.programming.target import Means, ProgrammingError, TargetChanges
-
-_BANDS = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
-_BLIND = "does not look at DSCP"
-_WITHOUT_PRIORITY = {"pfifo_fast": _BANDS, "prio": _BANDS, "pfifo": _BLIND, "fq_codel": _BLIND}
-"""What queueing disciplines do with marks; two sort by the old TOS bits."""
+from lifecycle.programming.target import Means
 
 
 class NftTarget(host.TableTarget):
@@ -66,24 +59,6 @@ class NftTarget(host.TableTarget):
             wanted.table,
         ]
         return "\n".join(lines)
-
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Compare, and warn where marks change nothing."""
-        planned = super().plan(rules)
-        if not planned.pending:
-            return planned
-        try:
-            found = host.qdiscs(self._tool, doing="list queueing disciplines")
-        except ProgrammingError:
-            return planned
-        warnings = tuple(
-            f"marking alone gives no priority on {each.dev}: its queueing discipline {each.kind} "
-            f"{_WITHOUT_PRIORITY[each.kind]}; add one that looks at these flows: "
-            f"lifecycle flows apply MANIFEST --target tc --device {each.dev} --rate RATE"
-            for each in found
-            if each.root and each.dev != "lo" and each.kind in _WITHOUT_PRIORITY
-        )
-        return replace(planned, warnings=warnings)
 
 
 TARGET = NftTarget

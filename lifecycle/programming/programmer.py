@@ -1,15 +1,13 @@
 """Keeps networks in step with the verified flows of one system: from reports to rules to targets.
 
 Also removes what dead runs left. What was applied manually stays: `lifecycle flows remove` or
-`lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+`lifecycle down` ends it. Whatever waits may be cancelled: the ledger has what was made.
 """
 
 from __future__ import annotations
 
-import math
 import socket
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import psutil
@@ -98,45 +96,8 @@ def route_source(destination: str) -> str:
         return canonical(str(sock.getsockname()[0]))
 
 
-class Removal:
-    """Removes everything of one run in networks, also what was applied manually.
-
-    One thread removes, another cancels.
-    """
-
-    def __init__(self, means: Means) -> None:
-        self._ledger = means.ledger
-        self._patience = means.patience
-        self._means = means
-
-    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
-        """Remove everything that the ledger lists, by whichever target it was made.
-
-        Args:
-            within_s: for all that servers are asked; None for the patience with each request.
-
-        Raises:
-            PartlyError: something could not be removed, or not in time; it stays listed.
-        """
-
-        def remove(record: TargetRecord) -> TargetChanges:
-            kind = target_kind(record.target)
-            return kind(kind.restore(record), self._means).remove()
-
-        with self._patience.within(within_s), self._ledger.locked():
-            return _each(self._ledger.read().targets, remove)
-
-    def cancel(self) -> None:
-        """From another thread: have what servers are asked fail at once, until `resume`."""
-        self._patience.cancelled.set()
-
-    def resume(self) -> None:
-        """Ask servers again after a `cancel`."""
-        self._patience.cancelled.clear()
-
-
-class Programmer(Removal):
-    """Programs targets with the verified flows of one system.
+class Programmer:
+    """Programs targets with the verified flows of one system, one call at a time.
 
     Args:
         source_address: observes where publishers send from; None believes the manifest only.
@@ -151,14 +112,13 @@ class Programmer(Removal):
         source_address: SourceAddress | None = None,
         treatment: Treatment | None = None,
     ) -> None:
-        super().__init__(means)
         self._plan = plan
         self._targets = tuple(targets)
+        self._means = means
         self._source_address = source_address
         self._treatment = treatment or Treatment()
-        self._applied: tuple[FlowRule, ...] | None = None
-        # What targets have, as far as is known: all of it once every target was brought up to date.
-        self._programmed: dict[str, FlowRule] = {}
+        self._asked: tuple[FlowRule, ...] = ()
+        self._is_done = False
         self.left_out: tuple[str, ...] = ()
 
     def replan(self, plan: Plan) -> None:
@@ -176,11 +136,11 @@ class Programmer(Removal):
         self.left_out = found.left_out
         return found
 
-    def diff(self, flows: Iterable[FlowReport]) -> tuple[TargetChanges, ...]:
+    async def diff(self, flows: Iterable[FlowReport]) -> tuple[TargetChanges, ...]:
         """Return what `update` would do; changes no network."""
         rules = self.rules(flows).rules
-        with self._ledger.locked():
-            return tuple(each.plan(rules) for each in self._targets)
+        async with self._means.ledger.locked():
+            return tuple([await each.plan(rules) for each in self._targets])
 
     def export(self, flows: Iterable[FlowReport]) -> str:
         """Return what targets would be given if nothing were there, as text.
@@ -191,7 +151,7 @@ class Programmer(Removal):
         rules = self.rules(flows)
         return "".join(each.export(rules) for each in self._targets)
 
-    def update(
+    async def update(
         self,
         flows: Iterable[FlowReport],
         *,
@@ -202,10 +162,10 @@ class Programmer(Removal):
 
         Args:
             flows: as last verified.
-            hold: a flow that was programmed and is not verified at this moment keeps its rule
+            hold: a flow that was asked for and is not verified at this moment keeps its rule
                 until it is verified again or is no longer declared: while a node restarts, its old
                 rule does no harm, and a session of a mobile network is costly to make again.
-            within_s: for all that servers are asked; None for the patience with each request.
+            within_s: for all that servers are asked; None bounds each request only.
 
         Returns:
             What was done, per target; nothing if the rules are the same as last time.
@@ -216,40 +176,23 @@ class Programmer(Removal):
         reports = tuple(flows)
         rules = self.rules(reports).rules
         if hold:
-            rules = _with_held(rules, self._programmed.values(), reports)
-        if rules == self._applied:
+            rules = _with_held(rules, self._asked, reports)
+        if rules == self._asked and self._is_done:
             return ()
-        # Forgotten first: if a target fails, the next call must not take it for done. What was
-        # programmed is not: it is held whether or not the last call succeeded.
-        self._applied = None
-        by_key = {each.key: each for each in rules}
-
-        def apply(target: Target) -> TargetChanges:
-            changes = target.apply(rules)
-            self._programmed |= by_key
-            return changes
-
-        with self._patience.within(within_s), self._ledger.locked():
-            try:
-                done = _each(self._targets, apply)
-            except LifecycleError:
-                listed = [entry for each in self._ledger.read().targets for entry in each.entries]
-                made = {each.key.rsplit(" ", 2)[0] for each in listed}  # without "to device"
-                self._programmed |= {key: each for key, each in by_key.items() if key in made}
-                raise
-        self._applied, self._programmed = rules, by_key
+        # If a target fails, the next call must not take it for done.
+        self._asked, self._is_done = rules, False
+        self._means.begin(within_s)
+        async with self._means.ledger.locked():
+            done = await _each(self._targets, lambda each: each.apply(rules))
+        self._is_done = True
         return done
 
-    def renew(self, *, within_s: float | None = None) -> float | None:
+    async def renew(self, *, within_s: float | None = None) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
-        with self._patience.within(within_s), self._ledger.locked():
-            due = [each.renew() for each in self._targets]
+        self._means.begin(within_s)
+        async with self._means.ledger.locked():
+            due = [await each.renew() for each in self._targets]
         return min((each for each in due if each is not None), default=None)
-
-    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
-        """Remove everything, see Removal."""
-        self._applied, self._programmed = None, {}
-        return super().close(within_s=within_s)
 
 
 def open_programmer(
@@ -285,23 +228,34 @@ def open_programmer(
     )
 
 
-def removal_of(directory: Path) -> Removal:
-    """Return what removes everything of the run in a directory.
+async def remove_programmed(
+    directory: Path, *, within_s: float | None = None
+) -> tuple[TargetChanges, ...]:
+    """Remove everything of a run in networks, by whichever target it was made or by hand.
+
+    Args:
+        directory: of the run; its ledger lists what is there.
+        within_s: for all that servers are asked; None bounds each request only.
 
     Raises:
         ProgrammingError: the ledger cannot be read.
+        PartlyError: something could not be removed, or not in time; it stays listed.
     """
     # The name as the ledger has it: that of a directory is made safe.
     system = Ledger(directory, "").read().system or directory.name.partition("@")[0]
-    return Removal(Means(Ledger(directory, system)))
+    means = Means(Ledger(directory, system))
+
+    async def remove(record: TargetRecord) -> TargetChanges:
+        kind = target_kind(record.target)
+        return await kind(kind.restore(record), means).remove()
+
+    means.begin(within_s)
+    async with means.ledger.locked():
+        return await _each(means.ledger.read().targets, remove)
 
 
-def sweep_orphans(
-    root: Path,
-    report: Callable[[str], None],
-    *,
-    own: str = "",
-    within_s: float | None = None,
+async def sweep_orphans(
+    root: Path, report: Callable[[str], None], *, own: str = "", within_s: float | None = None
 ) -> None:
     """Remove what the dead runs of this user left in networks.
 
@@ -309,24 +263,27 @@ def sweep_orphans(
         root: directory of all run directories, see run_directory.runtime_root.
         report: takes what was removed, and what could not be and stays listed, as text for people.
         own: name of the caller's own run, whose directory it holds itself.
-        within_s: for all that servers are asked; None for the patience with each request.
+        within_s: for what servers are asked of each run; None bounds each request only.
     """
-    until_s = math.inf if within_s is None else time.monotonic() + within_s
-    for directory in sorted(root.iterdir()) if root.is_dir() else ():
-        if not has_ledger(directory) or (directory.name != own and is_held(directory)):
-            continue
+    for directory in _with_ledgers(root, own):
         try:
             if not owner_is_dead(Ledger(directory, "").read()):
                 continue
-            for each in removal_of(directory).close(within_s=until_s - time.monotonic()):
+            for each in await remove_programmed(directory, within_s=within_s):
                 if each.changes:
                     report(f"left by a killed supervisor: {each.render(done=True)}")
         except LifecycleError as error:
             report(str(error))
 
 
+def _with_ledgers(root: Path, own: str) -> list[Path]:
+    """Return the run directories with a ledger that nobody else holds."""
+    found = sorted(root.iterdir()) if root.is_dir() else []
+    return [each for each in found if has_ledger(each) and (each.name == own or not is_held(each))]
+
+
 def _with_held(
-    rules: tuple[FlowRule, ...], programmed: Iterable[FlowRule], reports: Sequence[FlowReport]
+    rules: tuple[FlowRule, ...], asked: Iterable[FlowRule], reports: Sequence[FlowReport]
 ) -> tuple[FlowRule, ...]:
     unsure = {
         (each.topic, each.publisher, each.subscription)
@@ -334,16 +291,14 @@ def _with_held(
         if each.outcome is not Outcome.OK or not each.source or not each.destination
     }
     keys = {each.key for each in rules}
-    held = tuple(
-        each
-        for each in programmed
-        if each.key not in keys and all(map(unsure.__contains__, each.names))
-    )
+    held = [each for each in asked if each.key not in keys and unsure.issuperset(each.names)]
     return tuple(sorted((*rules, *held), key=lambda each: each.key))
 
 
-def _each(things: Iterable[T], do: Callable[[T], TargetChanges]) -> tuple[TargetChanges, ...]:
-    done, failed = each_done(things, do)
+async def _each(
+    things: Iterable[T], do: Callable[[T], Awaitable[TargetChanges]]
+) -> tuple[TargetChanges, ...]:
+    done, failed = await each_done(things, do)
     if len(failed) == 1 and not done:
         raise failed[0][1]
     if failed:

@@ -1,8 +1,8 @@
 """A target that keeps one thing per flow and device at a server: subscriptions, sessions.
 
 What NEF and CAMARA have in common: which ends of a flow are devices of the mobile network, and the
-difference between rules, ledger and server. A request is written down before it is sent, so that
-what was made is found again even if the answer was lost.
+difference between rules and ledger. A request is written down before it is sent, so that what was
+made is found again even if the answer was lost.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ from __future__ import annotations
 import abc
 import ipaddress
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from urllib.parse import quote
 
-import msgspec
-from msgspec import to_builtins
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import UsageError
-from lifecycle.programming.http import Api, IpNetwork, ServerSettings, load_settings, text_of
+from lifecycle.programming.http import Api, IpNetwork, ServerSettings, load_settings
 from lifecycle.programming.ledger import Entry, TargetRecord
 from lifecycle.programming.rules import FlowRule, RuleSet, expressed
 from lifecycle.programming.target import (
@@ -103,12 +101,13 @@ def class_name(rule: FlowRule, names: Mapping[int, str], *, setting: str) -> str
     return names[rule.five_qi]
 
 
-class Wanted(msgspec.Struct, frozen=True, kw_only=True):
+class Wanted(NamedTuple):
     """What to ask the network for one flow and one of its ends.
 
     Attributes:
         key: of the FlowRule, with the direction behind it: unique, and as stable.
         rule: that it is made from.
+        body: of the request.
     """
 
     key: str
@@ -116,20 +115,23 @@ class Wanted(msgspec.Struct, frozen=True, kw_only=True):
     body: Body
 
 
-class Made(msgspec.Struct, frozen=True, kw_only=True):
-    """One thing as the server has it.
+class Made(NamedTuple):
+    """One thing as the server has made it.
 
     Attributes:
         id: what the server calls it.
-        expires_s: on the clock of Patience.steady_s; None if it does not expire.
+        expires_s: on the clock of `steady_s`; None if it does not expire.
         detail: for people: "granted for 600 s instead of 3600 s".
-        differs: why it is not what was asked for; empty if it is.
     """
 
     id: str
     expires_s: float | None = None
     detail: str = ""
-    differs: str = ""
+
+
+def steady_s() -> float:
+    """Return seconds since the host was started, on a clock that only goes forward."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class ServerTarget(Target):
@@ -140,6 +142,7 @@ class ServerTarget(Target):
 
     Attributes:
         collection: path of all things, "/sessions"; without the slash, what an export calls them.
+        settings_type: of its key in the settings file.
     """
 
     hint = "give --config FILE"
@@ -149,7 +152,7 @@ class ServerTarget(Target):
     def __init__(self, settings: str, means: Means) -> None:
         super().__init__(settings, means)
         path = str(Path(settings).absolute())
-        self._server: Any = load_settings(settings).get(self.kind)
+        self._server: Any = load_settings(settings, self.kind, self.settings_type)
         if self._server is None:
             raise SettingsError(
                 f"cannot program {self.kind}: settings {path!r} have no key {self.kind!r}"
@@ -171,7 +174,7 @@ class ServerTarget(Target):
     @classmethod
     def restore(cls, record: TargetRecord) -> str:
         """Return the settings file of a record, if it is still of the same server."""
-        own = load_settings(record.settings).get(cls.kind)
+        own = load_settings(record.settings, cls.kind, cls.settings_type)
         scope = "" if own is None else own.scope
         if scope != record.scope:
             raise SettingsError(
@@ -182,9 +185,10 @@ class ServerTarget(Target):
 
     @classmethod
     def token_variables(cls, settings: str) -> frozenset[str]:
-        """Return those of every server of the file."""
-        servers = load_settings(settings).values()
-        return frozenset(each.token.env for each in servers if each.token and each.token.env)
+        """Return that of the server, if its token is in one."""
+        own = load_settings(settings, cls.kind, cls.settings_type)
+        named = own is not None and own.token is not None and own.token.env
+        return frozenset([named] if named else ())
 
     def export(self, rules: RuleSet) -> str:
         """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
@@ -226,119 +230,98 @@ class ServerTarget(Target):
         """
 
     @abc.abstractmethod
-    def create(self, body: Body) -> Made:
-        """Ask for it."""
+    async def create(self, body: Body) -> Made:
+        """Ask for it.
 
-    @abc.abstractmethod
-    def look(self, id_: str, body: Body) -> Made | None:
-        """Look at one, and compare it with what was asked for; None if there is none.
-
-        Args:
-            id_: what the server calls it; empty looks for one that is just as asked for.
-            body: that was asked for.
+        Raises:
+            HttpError: refused, or the answer is of no use.
         """
 
-    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - may be compared
-        """Change one; here by a new one, after the old, as two for one flow may be a conflict."""
-        self.delete(id_)
-        return self.create(body)
+    @abc.abstractmethod
+    async def look(self, body: Body) -> str:
+        """Return the id of one that was asked for and not answered; empty if there is none."""
 
-    def delete(self, id_: str) -> None:
+    async def delete(self, id_: str) -> None:
         """Delete one; that it is gone already is no error."""
-        self._api.request("DELETE", self.path(id_), may_be_gone=True)
+        await self._api.request("DELETE", self.path(id_), may_be_gone=True)
 
     def path(self, id_: str) -> str:
         """Return the path of one thing."""
         return f"{self.collection}/{quote(id_, safe='')}"
 
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Compare rules, ledger and server; asks the server about each thing of ours."""
+    async def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Compare rules and ledger."""
         wanted, left_out = self._wanted(rules)
         changes = tuple(change for change, _ in self._changes(wanted))
         return TargetChanges(target=self.name, changes=changes, left_out=left_out)
 
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+    async def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, one flow after the other.
 
         Raises:
             PartlyError: for some flows it failed; what was to be deleted stays in the ledger.
         """
         wanted, left_out = self._wanted(rules)
-        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
-        done, failed = each_done(planned, self._make)
-        made = TargetChanges(target=self.name, changes=tuple(done))
+        changes = self._changes(wanted)
+        done, failed = await each_done(changes, self._make)
+        made = TargetChanges(target=self.name, changes=tuple(done), left_out=left_out)
         if failed:
             errors = [(change.key, error) for (change, _), error in failed]
-            text = [made.render(done=True)] if made.pending else []
-            raise PartlyError(self.name, len(planned), errors, done=text)
-        return replace(made, left_out=left_out)
+            text = [replace(made, left_out=()).render(done=True)] if made.pending else []
+            raise PartlyError(self.name, len(changes), errors, done=text)
+        return made
 
-    def _changes(self, wanted: Sequence[Wanted]) -> Iterator[tuple[FlowChange, Body]]:
-        """Yield what is to be done, with the body that is wanted."""
+    def _changes(self, wanted: Sequence[Wanted]) -> list[tuple[FlowChange, Body]]:
+        """Return what is to be done, with the body that is wanted.
+
+        Deletions come first: what is in the way of something new goes before it.
+        """
         keys = {each.key for each in wanted}
         entries = self._entries()
-        # Deletions come first: what is in the way of something new goes before it.
-        for entry in entries.values():
-            if entry.key not in keys:
-                yield FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what), {}
+        found: list[tuple[FlowChange, Body]] = [
+            (FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what), {})
+            for each in entries.values()
+            if each.key not in keys
+        ]
         for each in wanted:
-            kind, detail = self._compare(entries.get(each.key), each.body)
+            entry, kind, detail = entries.get(each.key), ChangeKind.UPDATE, ""
+            if entry is None or not entry.id:
+                kind = ChangeKind.CREATE
+                detail = "" if entry is None else "asked for before, and not answered"
+            elif json.loads(entry.body) == each.body:
+                kind = ChangeKind.KEEP
             what = f"{each.rule.describe()}, {each.rule.asks}"
-            yield FlowChange(kind=kind, key=each.key, what=what, detail=detail), each.body
+            found.append((FlowChange(kind=kind, key=each.key, what=what, detail=detail), each.body))
+        return found
 
-    def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
-        if entry is None:
-            return ChangeKind.CREATE, ""
-        asked: Body = json.loads(entry.body)
-        seen = self.look(entry.id, asked)
-        if seen is None:
-            gone = "gone from the server" if entry.id else "asked for before, but never made"
-            return ChangeKind.CREATE, gone
-        if not entry.id or (seen.expires_s or math.inf) < (entry.expires_s or math.inf) - 1:
-            self._note(entry.key, replace(entry, id=seen.id, expires_s=seen.expires_s))
-        if asked != body:
-            return ChangeKind.UPDATE, ""
-        if seen.differs:
-            return ChangeKind.UPDATE, seen.differs
-        return ChangeKind.KEEP, seen.detail
+    async def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
+        """Make one change; return it with what came of it.
 
-    def _make(self, planned: tuple[FlowChange, Body]) -> FlowChange:
-        """Make one change; return it with what came of it."""
+        What is there is deleted before there is something new: two for one flow may be a conflict.
+        """
         change, body = planned
         if change.kind is ChangeKind.KEEP:
             return change
-        if change.kind is ChangeKind.CREATE:
-            made = self._create(change, body)
-            return replace(change, detail=made.detail or change.detail)
-        entry = self._entries()[change.key]
-        asked = json.loads(entry.body)
-        if change.kind is ChangeKind.UPDATE:
-            made = self.update(entry.id, asked, body)
-            self._note(change.key, _entry(change, body, made))
-            return replace(change, detail=made.detail or change.detail)
-        found = Made(id=entry.id) if entry.id else self.look("", asked)
-        if found is not None:
-            self.delete(found.id)
-        self._note(change.key, None)
-        return change
+        if (entry := self._entries().get(change.key)) is not None:
+            if id_ := entry.id or await self.look(json.loads(entry.body)):
+                await self.delete(id_)
+            self._note(change.key, None)
+        if change.kind is ChangeKind.DELETE:
+            return change
+        entry = Entry(key=change.key, what=change.what, body=json.dumps(body, sort_keys=True))
+        made = await self._create(entry)
+        return replace(change, detail=made.detail or change.detail)
 
-    def _create(self, change: FlowChange, body: Body) -> Made:
-        self._note(change.key, _entry(change, body, None))
-        made: Made | None = None
+    async def _create(self, entry: Entry) -> Made:
+        """Ask for what an entry says; it stays, without an id, while it may have been made."""
+        self._note(entry.key, entry)
         try:
-            made = self.create(body)
+            made = await self.create(json.loads(entry.body))
         except HttpError as error:
             if not error.uncertain:
-                self._note(change.key, None)
-                raise
-            try:
-                made = self.look("", body)
-            except HttpError as second:
-                raise error from second
-            if made is None:
-                # The entry stays pending: the server may still be making it.
-                raise
-        self._note(change.key, _entry(change, body, made))
+                self._note(entry.key, None)
+            raise
+        self._note(entry.key, replace(entry, id=made.id, expires_s=made.expires_s))
         return made
 
     def _entries(self) -> dict[str, Entry]:
@@ -350,31 +333,3 @@ class ServerTarget(Target):
         every = {**self._entries(), key: entry}
         entries = tuple(each for each in every.values() if each is not None)
         self._ledger.put(replace(self._record, entries=entries))
-
-
-def differs(
-    asked: Mapping[str, Any], seen: msgspec.Struct, keys: Iterable[str], *, missing: bool = False
-) -> str:
-    """Return why what a server shows is not what was asked for; empty if it is.
-
-    Args:
-        asked: our body.
-        seen: the server's, which leaves out what is not shown; it may add to ours.
-        keys: that are compared.
-        missing: something that the server does not show differs too.
-    """
-    shown = to_builtins(seen)
-    for key in keys:
-        if (missing or key in shown) and shown.get(key) != asked.get(key):
-            return f"the server has {key} {text_of(str(shown.get(key)))!r}"
-    return ""
-
-
-def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
-    return Entry(
-        key=change.key,
-        what=change.what,
-        id="" if made is None else made.id,
-        expires_s=None if made is None else made.expires_s,
-        body=json.dumps(body, sort_keys=True),
-    )

@@ -1,16 +1,13 @@
-"""What a network target is, what it changes, how long it is waited for, and what can go wrong."""
+"""What a network target is, what it changes, and what can go wrong."""
 
 from __future__ import annotations
 
 import abc
-import asyncio
-import contextlib
 import enum
 import importlib
 import math
-import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
@@ -62,13 +59,11 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         target: for people: "nft table inet flowqos_teleop", "tc on eth0".
         left_out: flows that this target cannot express, each with its reason.
-        warnings: what people should know, whole sentences.
     """
 
     target: str
     changes: tuple[FlowChange, ...] = ()
     left_out: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
     @property
     def pending(self) -> bool:
@@ -90,105 +85,28 @@ class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
             what = f": {each.what}" if each.what else ""
             lines.append(f"  {_SIGNS[each.kind]} {each.key}{what}{detail}")
         lines += [f"  left out: {reason}" for reason in self.left_out]
-        lines += [f"  warning: {warning}" for warning in self.warnings]
         return "\n".join(lines)
 
 
-_CANCEL_CHECK_S = 0.05
-
-
-class Patience:
-    """Bounds all that one programmer asks of servers; without end until `within`.
-
-    One thread works, another cancels.
-
-    Args:
-        attempts: at most so many requests.
-        first_s: wait before the second, then doubled each time.
-        longest_s: longest single wait of our own choice.
-        total_s: one request with all its attempts, and all waits between them; a Retry-After beyond
-            it is not waited for.
+class Means:
+    """What targets are opened with: the ledger of the system, and how long servers may take.
 
     Attributes:
-        cancelled: set while work is to end at once.
+        until_s: when all that servers are asked must have been answered, on the clock of
+            time.monotonic.
     """
 
-    def __init__(
-        self,
-        *,
-        attempts: int = 5,
-        first_s: float = 0.5,
-        longest_s: float = 8.0,
-        total_s: float = 60.0,
-    ) -> None:
-        self.attempts, self.first_s = attempts, first_s
-        self.longest_s, self.total_s = longest_s, total_s
-        self._until_s = math.inf
-        self.cancelled = threading.Event()
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self.until_s = math.inf
 
-    def now_s(self) -> float:
-        """Return seconds since the epoch."""
-        return time.time()
-
-    def steady_s(self) -> float:
-        """Return seconds since the host was started, on a clock that only goes forward."""
-        return time.clock_gettime(time.CLOCK_BOOTTIME)
-
-    def sleep(self, seconds: float) -> None:
-        """Wait, or until it is cancelled."""
-        self.cancelled.wait(seconds)
-
-    @contextlib.contextmanager
-    def within(self, seconds: float | None) -> Iterator[None]:
-        """Bound what is done inside, None by nothing; an outer bound holds as well."""
-        outer_s = self._until_s
-        if seconds is not None:
-            self._until_s = min(outer_s, time.monotonic() + seconds)
-        try:
-            yield
-        finally:
-            self._until_s = outer_s
+    def begin(self, within_s: float | None) -> None:
+        """Give servers so long from now on; None bounds each request only."""
+        self.until_s = math.inf if within_s is None else time.monotonic() + within_s
 
     def left_s(self) -> float:
         """Return the seconds that are left: 0 if none are, infinity if there is no bound."""
-        return 0.0 if self.cancelled.is_set() else max(0.0, self._until_s - time.monotonic())
-
-    def run(self, work: Coroutine[Any, Any, T], most_s: float) -> T:
-        """Run a coroutine to its end, or cancel it after `most_s`, or once there is no time left.
-
-        Raises:
-            TimeoutError: there was no time left.
-        """
-        # Not asyncio.run, which waits for names that are still looked up.
-        loop = asyncio.new_event_loop()
-        task = loop.create_task(work)
-        try:
-            with self.within(most_s):
-                loop.run_until_complete(self._bounded(task))
-            if not task.done():
-                raise TimeoutError
-            return task.result()
-        finally:
-            if task.cancel():
-                loop.run_until_complete(asyncio.wait([task]))
-            loop.run_until_complete(loop.shutdown_asyncgens())  # of an answer that is cut off
-            loop.close()
-
-    async def _bounded(self, task: asyncio.Task[Any]) -> None:
-        while not task.done() and (left_s := self.left_s()) > 0:
-            await asyncio.wait({task}, timeout=min(left_s, _CANCEL_CHECK_S))
-
-
-class Means(msgspec.Struct, frozen=True):
-    """What targets are opened with.
-
-    Attributes:
-        ledger: of the system.
-        patience: with servers, of all targets together.
-    """
-
-    ledger: Ledger
-    patience: Patience = msgspec.field(default_factory=Patience)
+        return max(0.0, self.until_s - time.monotonic())
 
 
 class Target(abc.ABC):
@@ -200,13 +118,11 @@ class Target(abc.ABC):
     Attributes:
         kind: name of the target.
         hint: how to give what it cannot do without; empty if there is nothing such.
-        settings_type: of its key in the settings file of servers; None if it is no server.
         name: for people: "nft table inet flowqos_teleop".
     """
 
     kind: ClassVar[str]
     hint: ClassVar[str] = ""
-    settings_type: ClassVar[type[msgspec.Struct] | None] = None
     name: str
 
     def __init__(self, settings: Any, means: Means) -> None:
@@ -247,18 +163,21 @@ class Target(abc.ABC):
         return frozenset()
 
     @abc.abstractmethod
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+    async def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare what should be with what is; changes nothing."""
 
     @abc.abstractmethod
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """Make it so, and return what was done; a second time changes nothing."""
+    async def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Make it so, and return what was done; a second time changes nothing.
 
-    def remove(self) -> TargetChanges:
+        Cancelled, what it may have made is in the ledger.
+        """
+
+    async def remove(self) -> TargetChanges:
         """Delete everything of ours."""
-        return self.apply(())
+        return await self.apply(())
 
-    def renew(self) -> float | None:
+    async def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""
         return None
 
@@ -312,15 +231,15 @@ def _either(words: Sequence[str]) -> str:
     return f"{', '.join(most)} or {last}" if most else last
 
 
-def each_done(
-    things: Iterable[T], do: Callable[[T], R]
+async def each_done(
+    things: Iterable[T], do: Callable[[T], Awaitable[R]]
 ) -> tuple[list[R], list[tuple[T, LifecycleError]]]:
     """Do it to each, whatever becomes of the others; return what was done, and what failed."""
     done: list[R] = []
     failed: list[tuple[T, LifecycleError]] = []
     for each in things:
         try:
-            done.append(do(each))
+            done.append(await do(each))
         except LifecycleError as error:  # noqa: PERF203 - the others go on
             failed.append((each, error))
     return done, failed
@@ -342,25 +261,14 @@ class HttpError(ProgrammingError):
     Attributes:
         status: HTTP status; 0 if there was no answer.
         uncertain: the request may have taken effect all the same.
-        again: it may be asked again.
-        after_s: how long the server asks to wait before that; None if it does not say.
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        status: int = 0,
-        uncertain: bool = False,
-        again: bool = False,
-        after_s: float | None = None,
-        hint: str = "",
+        self, message: str, *, status: int = 0, uncertain: bool = False, hint: str = ""
     ) -> None:
         super().__init__(message, hint=hint)
         self.status = status
         self.uncertain = uncertain
-        self.again = again
-        self.after_s = after_s
 
 
 class PartlyError(ProgrammingError):

@@ -20,11 +20,13 @@ from __future__ import annotations
 import enum
 import math
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
+from lifecycle.codec import from_json
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
@@ -266,12 +268,37 @@ def _htb(classes: Sequence[TrafficClass], settings: TcSettings) -> Iterator[str]
         )
 
 
+class Qdisc(msgspec.Struct, frozen=True, kw_only=True):
+    """What is read of a queueing discipline in the list of `tc -j qdisc show`."""
+
+    kind: str
+    dev: str = ""
+    handle: str = "0:"
+    root: bool = False
+
+
+async def qdiscs(tool: host.HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
+    """Return the queueing disciplines that `tc -j qdisc show` lists.
+
+    Raises:
+        ProgrammingError: it failed, or what it prints is no such list.
+    """
+    argv = ("tc", "-j", "qdisc", "show", *options)
+    text = await host.demand(tool, argv, doing=doing)
+    try:
+        return from_json(text.strip() or "[]", tuple[Qdisc, ...])
+    except ValueError as error:
+        raise ProgrammingError(
+            f"cannot {doing}: what {shlex.join(argv)!r} prints is no list of qdiscs: {error}",
+            hint="look at what it prints, and which program that is",
+        ) from error
+
+
 class TcTarget(host.TableTarget):
     """One device."""
 
     kind = "tc"
     hint = "give --device eth0 --rate 20mbit"
-    gone = "the qdisc was gone"
 
     def __init__(
         self, settings: TcSettings, means: Means, tool: host.HostTool | None = None
@@ -357,42 +384,43 @@ class TcTarget(host.TableTarget):
         ]
         return "\n".join(lines)
 
-    def found(self) -> str:
-        """Return the table, where the device has our qdisc."""
-        return f"{OWNED_HANDLE}\n{self.listing()}" if self._own_root() else ""
+    async def found(self) -> bool:
+        """Whether the device has our qdisc, and there is our table."""
+        return await self._own_root() and await self.has_table()
 
-    def write(self, wanted: host.Wanted, *, anew: bool) -> None:
+    async def write(self, wanted: host.Wanted, *, anew: bool) -> None:
         """Write the table, and before it the qdisc and its classes anew."""
         if anew:
-            if self._is_ours():
-                self.clear()
-            self._batch(wanted.beside)
-        self.write_table(wanted.table)
+            if await self.has_begun():
+                await self.clear()
+            await self._batch(wanted.beside)
+        await self.write_table(wanted.table)
 
-    def clear(self) -> bool:
+    async def clear(self) -> bool:
         """Delete our qdisc and our table, where they are."""
-        ours = self._is_ours()
+        ours = await self.has_begun()
         if ours:
-            self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
-        return super().clear() or ours
+            await self._batch(f"qdisc del dev {self._device} root handle {OWNED_HANDLE}\n")
+        return await super().clear() or ours
 
-    def _root(self) -> host.Qdisc | None:
+    async def _root(self) -> Qdisc | None:
         """The device's root qdisc; None if there is no such device."""
         try:
-            listed = host.qdiscs(self._tool, "dev", self._device, doing=f"read {self.name}")
+            listed = await qdiscs(self._tool, "dev", self._device, doing=f"read {self.name}")
         except ProgrammingError as error:
             if _NO_DEVICE.search(error.message):
                 return None
             raise
-        return next((each for each in listed if each.root), host.Qdisc(kind="noqueue"))
+        return next((each for each in listed if each.root), Qdisc(kind="noqueue"))
 
-    def _is_ours(self) -> bool:
-        root = self._root()
+    async def has_begun(self) -> bool:
+        """Whether the device has our qdisc."""
+        root = await self._root()
         return root is not None and root.handle == OWNED_HANDLE
 
-    def _own_root(self) -> bool:
+    async def _own_root(self) -> bool:
         """Whether the root qdisc is ours; False if the device has only what the kernel gave it."""
-        device, root = self._device, self._root()
+        device, root = self._device, await self._root()
         if root is None:
             raise ProgrammingError(
                 f"cannot find device {device!r} on this host", hint="see: ip link"
@@ -405,7 +433,7 @@ class TcTarget(host.TableTarget):
                 f"{root.handle}",
                 hint=f"use another device, or remove it: tc qdisc del dev {device} root",
             )
-        if self._ledger.find(self._record) is None and not self.listing():
+        if self._ledger.find(self._record) is None and not await self.has_table():
             raise ProgrammingError(
                 f"cannot use {self.name}: its root qdisc {root.handle} was made by lifecycle, but "
                 f"not for system {self._ledger.system!r} of this user",
@@ -414,8 +442,9 @@ class TcTarget(host.TableTarget):
             )
         return True
 
-    def _batch(self, lines: str) -> None:
-        host.demand(self._tool, ("tc", "-batch", "-"), doing=f"program {self.name}", stdin=lines)
+    async def _batch(self, lines: str) -> None:
+        doing = f"program {self.name}"
+        await host.demand(self._tool, ("tc", "-batch", "-"), doing=doing, stdin=lines)
 
 
 def _guarantee(text: str) -> tuple[str, int]:

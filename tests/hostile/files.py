@@ -216,9 +216,10 @@ def _settings(make: Make, place: Place) -> None:
     check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder)}))
     from lifecycle.errors import LifecycleError
     from lifecycle.programming.http import load_settings
+    from lifecycle.programming.nef import NefSettings
 
     try:
-        load_settings(folder / "targets.json")
+        load_settings(folder / "targets.json", "nef", NefSettings)
     except LifecycleError as error:
         if "\n" in str(error) or not str(error).isprintable():
             raise Unhandled(repr(str(error))) from error

@@ -6,6 +6,7 @@ Owns: `READERS`, the one list of them, which property tests go through
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import json
 import os
@@ -25,9 +26,10 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
-from lifecycle.programming.host import HostTool, qdiscs
+from lifecycle.programming.host import HostTool
 from lifecycle.programming.http import load_settings
 from lifecycle.programming.ledger import Ledger
+from lifecycle.programming.nef import NefSettings
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.target import Means, ProgrammingError
 from lifecycle.run_directory import read_record
@@ -89,17 +91,19 @@ def _ledger(path: Path) -> object:
 
 
 def _qdiscs(data: bytes, _: Path) -> object:
-    return qdiscs(FakeTool(("tc", printed(_text(data)))), doing="list qdiscs")
+    from lifecycle.programming.tc import qdiscs
+
+    return asyncio.run(qdiscs(FakeTool(("tc", printed(_text(data)))), doing="list qdiscs"))
 
 
 def _nft(data: bytes, folder: Path) -> object:
     tool = FakeTool(("nft", printed(_text(data))))
-    return NftTarget(None, Means(Ledger(folder, "robot")), tool).plan([])
+    return asyncio.run(NftTarget(None, Means(Ledger(folder, "robot")), tool).plan([]))
 
 
 def _printed(data: bytes, folder: Path) -> object:
     (folder / "out").write_bytes(data)
-    return HostTool().run(["cat", str(folder / "out")])
+    return asyncio.run(HostTool().run(["cat", str(folder / "out")]))
 
 
 def _tc(data: bytes, folder: Path) -> object:
@@ -107,10 +111,10 @@ def _tc(data: bytes, folder: Path) -> object:
 
     tool = FakeTool(
         ("tc", printed(_text(data))),
-        ("nft -s list", failed("Error: No such file or directory")),
+        ("nft list", failed("Error: No such file or directory")),
     )
     settings = TcSettings(device="eth0", link_kbit=20_000)
-    return TcTarget(settings, Means(Ledger(folder, "robot")), tool).plan([])
+    return asyncio.run(TcTarget(settings, Means(Ledger(folder, "robot")), tool).plan([]))
 
 
 _SEEN = perfect(PLAN, Stage.ACTIVE)
@@ -185,7 +189,7 @@ READERS: dict[str, Reader] = {
     ),
     "settings of a server": Reader(
         good=json.dumps({"nef": nef_settings("https://nef.test")}).encode(),
-        read=_file("targets.json", lambda path: load_settings(str(path))),
+        read=_file("targets.json", lambda path: load_settings(str(path), "nef", NefSettings)),
         errors=(LifecycleError,),
     ),
     "nft listing": Reader(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import ast
 import graphlib
-import re
 import subprocess
 import sys
 from pathlib import Path
 
-from lifecycle import graph
 from lifecycle.network.medium import Medium
 
 ROOT = Path(__file__).parents[2]
@@ -39,14 +37,6 @@ def test_the_core_of_a_supervisor_is_loaded_without_a_loop() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stderr
-
-
-def test_the_api_page_lists_what_the_graph_offers() -> None:
-    listed = re.search(r"members: \[(.*)\]", (ROOT / "docs" / "api.md").read_text())
-    assert listed is not None
-    offered = [each for names in graph._PUBLIC.values() for each in names]
-    assert sorted(listed[1].split(", ")) == sorted(offered)
-    assert all(getattr(graph, each) is not None for each in offered)
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import click
@@ -11,11 +10,13 @@ from msgspec.structs import asdict
 
 from lifecycle.cli import common
 from lifecycle.codec import Count, says
-from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.printable import lines
 from lifecycle.supervisor.control.protocol import ChangedNodes
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lifecycle.plan.model import Plan
     from lifecycle.supervisor.control.protocol import Answer
 
@@ -79,7 +80,9 @@ def command(
     it, and with 0 once the system is active and verified by it.
     """
     plan = common.load_plan(manifest, assignments, machine=machine)
-    path = _run_of(plan, machine)
+    from lifecycle.run_directory import find_run, run_name, run_roots
+
+    path = find_run(run_roots(os.environ), run_name(plan, machine))
     as_text = format_ == "text"
     answer = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
     change = answer.change
@@ -125,42 +128,6 @@ def command(
             f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
         )
     return report.exit_code
-
-
-def _run_of(plan: Plan, machine: str) -> Path:
-    """Return the directory of the run that a manifest is for.
-
-    Raises:
-        UsageError: nothing of this name runs in its domain.
-    """
-    from lifecycle.run_directory import find_run, run_name, run_roots, running
-
-    roots = run_roots(os.environ)
-    name = run_name(plan, machine)
-    try:
-        return find_run(roots, name)
-    except UsageError:
-        others = [each.name for each in running(*roots) if _is_by(each, plan)]
-        if len(others) != 1:
-            raise
-    raise UsageError(
-        f"cannot apply {plan.manifest_path} to {others[0]!r}: a running system keeps its name, its "
-        f"domain and its machine, and this is a manifest of {name!r}",
-        hint=f"end it and start it anew: lifecycle down {others[0]}, then lifecycle up",
-    )
-
-
-def _is_by(path: Path, plan: Plan) -> bool:
-    """Whether a run is of a system of the same name, or began with the same file."""
-    if path.name.rpartition("@")[0] == plan.system:
-        return True
-    from lifecycle.supervisor.control.protocol import status
-
-    try:
-        manifest = status(path).manifest
-    except (UsageError, TimeoutError, OSError):
-        return False
-    return bool(manifest) and Path(manifest).absolute() == Path(plan.manifest_path).absolute()
 
 
 def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: float) -> Answer:

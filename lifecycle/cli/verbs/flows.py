@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import os
@@ -21,6 +22,7 @@ from lifecycle.cli.standard_streams import watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
+from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import FlowReport
 
@@ -98,14 +100,6 @@ def command() -> None:
     metavar="FILE",
     help="Write what is measured into a CSV file, each second a row for each flow, until Ctrl-C.",
 )
-@click.option(
-    "--for",
-    "for_s",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End --record after so long.",
-)
-@click.option("--force", is_flag=True, help="Have --record replace a file that is there already.")
 @_timeout
 @common.network_options(
     "--export",
@@ -120,16 +114,12 @@ def _show(
     format_: str,
     watch: bool,
     record: Path | None,
-    for_s: float | None,
-    force: bool,
     timeout: float,
     export_: str | None,
     **rest: Any,
 ) -> int:
     from lifecycle.supervisor.run import looking
 
-    if record is None and (force or for_s is not None):
-        raise UsageError("cannot use --for or --force without --record FILE")
     if record is not None and (watch or export_ is not None):
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
     if watch and export_ is not None:
@@ -144,7 +134,7 @@ def _show(
         )
     plan = _plan_of(target, assignments)
     if record is not None:
-        return _record(plan, Record(record, replaces=force), for_s)
+        return _record(plan, Record(record))
     if watch:
         return _watch(plan, format_)
     asked = click.get_current_context().get_parameter_source("timeout")
@@ -197,34 +187,27 @@ _EACH_S = 1.0
 """What is measured changes so often."""
 
 
-def _record(plan: Plan, record: Record, for_s: float | None) -> int:
-    """Write what is measured each second, until it is over or the supervisor ends."""
+def _record(plan: Plan, record: Record) -> int:
+    """Write what is measured each second, until it is interrupted or the supervisor ends."""
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
     with contextlib.closing(record):
         try:
             if path is not None:
-                _record_supervised(path, record, for_s)
+                _record_supervised(path, record)
             else:
-                follow_running(
-                    plan,
-                    lambda seen: record.add(seen.verdict.measured),
-                    each_s=_EACH_S,
-                    for_s=for_s,
-                )
+                follow_running(plan, lambda seen: record.add(seen.verdict.measured), each_s=_EACH_S)
         finally:
             common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
     return ExitCode.OK
 
 
-def _record_supervised(path: Path, record: Record, for_s: float | None) -> None:
+def _record_supervised(path: Path, record: Record) -> None:
     from lifecycle.supervisor.control.protocol import status
 
     began_s = time.monotonic()
     for number in itertools.count():
-        if for_s is not None and number * _EACH_S >= for_s:
-            return
         time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
         try:
             measured = status(path).measured
@@ -268,7 +251,7 @@ def apply(
 
     programmer = _open(plan, options, treatment)
     try:
-        changes = programmer.diff(flows) if dry_run else programmer.update(flows)
+        changes = asyncio.run(programmer.diff(flows) if dry_run else programmer.update(flows))
     except PartlyError as error:
         if error.done:
             path = shlex.quote(plan.manifest_path)
@@ -282,7 +265,10 @@ def apply(
 
 def remove(plan: Plan) -> int:
     """Remove everything of the system from every network that it was applied to."""
-    changes = _open(plan, ()).close()
+    from lifecycle.programming.programmer import remove_programmed
+
+    directory = runtime_root(os.environ) / run_name(plan, "")
+    changes = asyncio.run(remove_programmed(directory))
     for each in changes:
         click.echo(each.render(done=True))
     if not changes:

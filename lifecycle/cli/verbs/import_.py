@@ -35,20 +35,19 @@ def command(
     from lifecycle.manifest.diagnostics import ManifestError
     from lifecycle.manifest.loading import load
 
+    folder = Path.cwd() if output is None else output.parent
     with contextlib.redirect_stdout(sys.stderr):  # what the file prints, and launch logs
-        found = evaluate(launch_file, parse_assignments(assignments))
+        found = evaluate(launch_file, parse_assignments(assignments), folder=folder)
     if not found.nodes:
         raise UsageError(
             f"cannot import {str(launch_file)!r}: it describes no node with these arguments",
             hint="; ".join(found.gaps[:3]),
         )
     name = system or _name(launch_file)
-    folder = Path.cwd() if output is None else output.parent
     text = to_launched_manifest(
         found,
         source=launch_file.name,
         system=name,
-        folder=folder,
         schema=schema_reference(folder),
     )
     for gap in gaps_of(found):

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -25,6 +26,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Task
 from rclpy.timer import Timer
+from rclpy.waitable import NumberOfEntities, Waitable
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.versions import private
@@ -267,6 +269,7 @@ class Watching:
         self.clients: list[Any] = []
         self.services: list[Any] = []
         self.waitables: list[Any] = []
+        self._beside: dict[Waitable, _Beside] = {}
 
     def take_services(self, node: Node, services: Collection[Any]) -> None:
         """Serve what a node offers, whoever spins the node; destroy them before it.
@@ -299,9 +302,69 @@ class Watching:
             self.waitables.remove(waitable)
         self._wake()
 
+    def take_waitable(self, waitable: Waitable, run: Callable[..., object]) -> None:
+        """Wait for what a node lists that an EventsExecutor runs; call it by `run` in there.
+
+        Again is harmless.
+        """
+        if waitable not in self._beside:
+            self._beside[waitable] = beside = _Beside(waitable, run)
+            self.add_waitable(beside)
+
+    def give_back(self, waitable: Waitable) -> None:
+        """Leave a waitable to who runs its node, or forget it if it is destroyed; again too."""
+        if (beside := self._beside.pop(waitable, None)) is not None:
+            beside.end()
+            self.remove_waitable(beside)
+
     def _wake(self) -> None:
         if self.executor is not None:
             self.executor.wake()
+
+
+class _Beside(Waitable):  # type: ignore[misc]  # rclpy is not typed
+    """A waitable, waited for beside the EventsExecutor, which finds nothing to wait for in it.
+
+    If something arrives between the removal of a waitable and the next turn of that executor, it
+    calls Python without the interpreter's lock: SIGSEGV (ros2/rclpy#1644). Removing one later or
+    destroying it later does not help; not having it there does.
+    """
+
+    def __init__(self, waitable: Waitable, run: Callable[..., object]) -> None:
+        super().__init__(ReentrantCallbackGroup())
+        self._waitable, self._run = waitable, run
+        self._is_ended = False
+        self._count, self._add = waitable.get_num_entities, waitable.add_to_wait_set
+        waitable.get_num_entities, waitable.add_to_wait_set = NumberOfEntities, lambda _: None
+
+    def end(self) -> None:
+        self._is_ended = True
+        del self._waitable.get_num_entities, self._waitable.add_to_wait_set
+
+    def __enter__(self) -> None:
+        self._waitable.__enter__()
+
+    def __exit__(self, *raised: object) -> None:
+        self._waitable.__exit__(*raised)
+
+    def get_num_entities(self) -> NumberOfEntities:
+        return self._count()
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        self._add(wait_set)
+
+    def is_ready(self, wait_set: Any) -> bool:
+        return bool(self._waitable.is_ready(wait_set))
+
+    def take_data(self) -> Any:
+        return self._waitable.take_data()
+
+    async def execute(self, taken_data: Any) -> None:
+        self._run(self._execute, taken_data)
+
+    async def _execute(self, taken_data: Any) -> None:
+        if not self._is_ended:
+            await self._waitable.execute(taken_data)
 
 
 class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is not typed

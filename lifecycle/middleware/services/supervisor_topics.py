@@ -109,9 +109,7 @@ class AlivePublisher:
         on_listener: called in the executor's thread when a subscriber is matched.
     """
 
-    def __init__(
-        self, node: Node, topic: str, on_listener: Callable[[], None] | None = None
-    ) -> None:
+    def __init__(self, node: Node, topic: str, on_listener: Callable[[], None]) -> None:
         self._node = node
         self._on_listener = on_listener
         self._has_listeners = threading.Event()
@@ -139,7 +137,7 @@ class AlivePublisher:
             self._has_listeners.clear()
         if info.current_count or self._ended.is_set():
             self._has_listeners.set()
-        if info.current_count_change > 0 and self._on_listener is not None:
+        if info.current_count_change > 0:
             self._on_listener()
 
     def _assert(self) -> None:

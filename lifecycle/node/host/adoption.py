@@ -141,6 +141,7 @@ class Adoption:
         self._wrap("__init__", self._initialise)
         self._wrap("destroy_node", self._destroy)
         self._wrap("add_waitable", self._add_waitable)
+        self._wrap("remove_waitable", self._remove_waitable)
         for name, (kind, names) in _FACTORIES.items():
             self._wrap(name, functools.partial(self._create, kind, names))
         for name in _REMOVERS:
@@ -207,10 +208,15 @@ class Adoption:
         return result
 
     def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
+        self._loop.take_waitable(node, waitable)  # before its executor can look
         add(node, waitable)
         kind, foreign = noted_action(node, waitable), self._foreign.get(id(node))
         if kind is not None and foreign is not None:
             foreign.made(kind, waitable)
+
+    def _remove_waitable(self, remove: Callable[..., None], node: Node, waitable: Any) -> None:
+        remove(node, waitable)
+        self._loop.watching.give_back(waitable)
 
     def _create(
         self,
@@ -234,7 +240,10 @@ class Adoption:
     def _remove(self, destroy: Callable[..., Any], node: Node, entity: Any) -> Any:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.removed(entity)
-        return destroy(node, entity)
+        result = destroy(node, entity)
+        for each in getattr(entity, "event_handlers", ()):
+            self._loop.watching.give_back(each)
+        return result
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]

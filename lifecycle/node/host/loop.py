@@ -186,10 +186,11 @@ class NodeLoop:
         self._executor = NodeExecutor(context=context)
         self._executor.add_node(self.watching)
         self._own: Any = self._executor
+        self._has_events = executor is Executor.EVENTS
         self._watchdog: Watchdog | None = None
         self._heartbeat: Heartbeat | None = None
         if executor is not Executor.SINGLE:
-            if executor is Executor.EVENTS:
+            if self._has_events:
                 from rclpy.experimental.events_executor import EventsExecutor
 
                 self._own = EventsExecutor(context=context)
@@ -224,6 +225,8 @@ class NodeLoop:
     def spin(self, node: Node) -> None:
         """Run a node's callbacks from now on, unless its own code has another executor do it."""
         if node.executor is None or node.executor is self._own:
+            for each in node.waitables:
+                self._take(each)
             self._own.add_node(node)
             if self._heartbeat is not None:
                 self._heartbeat.spin(node)
@@ -234,6 +237,17 @@ class NodeLoop:
             if self._heartbeat is not None:
                 self._heartbeat.rest(node)
             self._own.remove_node(node)
+            for each in node.waitables:
+                self.watching.give_back(each)
+
+    def take_waitable(self, node: Node, waitable: Any) -> None:
+        """Wait for what a node is about to list in the way of the executor that runs it."""
+        if node.executor is self._own:
+            self._take(waitable)
+
+    def _take(self, waitable: Any) -> None:
+        if self._has_events:
+            self.watching.take_waitable(waitable, self.call_soon)
 
     def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
@@ -365,13 +379,17 @@ class NodeLoop:
         os._exit(self._code or 1)
 
 
-def _is_of_destroyed(error: BaseException) -> bool:
-    """Return whether rclpy could not take an event, because its endpoint was destroyed since.
+_TAKING_OR_ANSWERING = {"take_data", "send_response", "_execute_goal_request"}
 
-    Its EventsExecutor has events in a queue, from which none is removed.
+
+def _is_of_destroyed(error: BaseException) -> bool:
+    """Return whether rclpy could not take or answer something, as its endpoint was destroyed since.
+
+    An async handler may have worked on it meanwhile, and rclpy's EventsExecutor has events in a
+    queue, from which none is removed.
     """
     *_, last = traceback.extract_tb(error.__traceback__)
-    return isinstance(error, InvalidHandle) and last.name == "take_data"
+    return isinstance(error, InvalidHandle) and last.name in _TAKING_OR_ANSWERING
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Run one node in a terminal, without a supervisor: by a manifest, or without one."""
+"""Run one node in a terminal, with a manifest's part of a plan, or without; no supervisor."""
 
 from __future__ import annotations
 

@@ -1,25 +1,21 @@
 """Programs networks for a run once its flows are verified, and leaves nothing behind.
 
-Owns: when programming happens in a run, and when the blocking `Programmer` is called: for the
-latest flows only, again after a failure with growing pauses, in time before something expires, and
-one last time to remove everything; the loop is never held up. Without `--program` nothing is made;
-what a person applied goes with the system. The package that programs takes long to import
-and most runs do not need it, so it loads on first use. Must not import rclpy.
+Owns: when programming happens in a run: for the latest flows only, again after a failure with
+growing pauses, in time before something expires, and one last time to remove everything. Without
+`--program` nothing is made; what a person applied goes with the system. The package that programs
+takes long to import and most runs do not need it, so it loads on first use. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.graph.loop import ended, set_within
-from lifecycle.middleware.process.control import no_room_for_threads
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
@@ -27,7 +23,7 @@ from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming.programmer import Programmer, Removal
+    from lifecycle.programming.programmer import Programmer
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -48,11 +44,7 @@ _SWEEP_S = 10.0
 
 
 class Networks:
-    """Networks of one run: the latest flows are programmed, in a thread; none without `programmer`.
-
-    Raises:
-        MiddlewareError: no thread can be started.
-    """
+    """Networks of one run: the latest flows are programmed; none without `programmer`."""
 
     def __init__(
         self, system: str, directory: Path, emit: Emitter, programmer: Programmer | None = None
@@ -66,13 +58,6 @@ class Networks:
         self._begun = False
         self._changed = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
-        self._one_at_a_time = asyncio.Lock()  # the programmer is of one thread
-        # A thread that is started at once: in the end there may be no room for one.
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="networks")
-        try:
-            self._thread.submit(int)
-        except RuntimeError as error:
-            raise no_room_for_threads(1) from error
         if programmer is not None:
             emit.listen(self._hear)
 
@@ -83,8 +68,8 @@ class Networks:
         is followed. Cancelled, it is over as soon as what is under way has been cut off.
 
         Raises:
-            BringUpError: a network could not be programmed, or not in time (None: the patience with
-                each request); what was made all the same is removed by `close`.
+            BringUpError: a network could not be programmed, or not in time (None bounds each
+                request only); what was made all the same is removed by `close`.
         """
         if self._programmer is None:
             return
@@ -108,39 +93,33 @@ class Networks:
         Once `hurry` is set, no server is waited for any more.
         """
         self._begun = False
-        removes: Removal | None = self._programmer
         try:
             await self._stop()
         finally:
-            if removes is None and (self._directory / LEDGER_NAME).is_file():
-                from lifecycle.programming.programmer import removal_of
+            if (self._directory / LEDGER_NAME).is_file():
+                await self._remove(hurry)
 
-                removes = removal_of(self._directory)
-            if removes is not None:
-                await self._remove(removes, hurry)
+    async def _remove(self, hurry: asyncio.Event) -> None:
+        """Remove everything, within CLOSE_S for all servers together."""
+        from lifecycle.programming.programmer import remove_programmed
 
-    async def _remove(self, removes: Removal, hurry: asyncio.Event) -> None:
-        """Remove everything, in the thread and within CLOSE_S for all servers together."""
-        is_late = hurry.is_set()
-        within_s = _HURRIED_S if is_late else CLOSE_S
-        loop = asyncio.get_running_loop()
-        remove = functools.partial(removes.close, within_s=within_s)
-        removing = loop.run_in_executor(self._thread, remove)
-        if not is_late:
-            hurried = asyncio.ensure_future(hurry.wait())
-            either: set[asyncio.Future[Any]] = {removing, hurried}
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            await ended(hurried)
-            if not removing.done():
-                removes.cancel()
+        within_s = _HURRIED_S if hurry.is_set() else CLOSE_S
+        removing = asyncio.ensure_future(remove_programmed(self._directory, within_s=within_s))
+        waits: list[asyncio.Future[Any]] = [removing]
+        if not hurry.is_set():
+            waits.append(asyncio.ensure_future(hurry.wait()))
         try:
-            done = await removing
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            if not removing.done():
+                self._report(f"ended before everything was removed; {_STILL_THERE}")
+                return
+            for each in removing.result():
+                if each.changes:
+                    self._report(each.render(done=True))
         except LifecycleError as error:
             self._report(f"{error}\n{_STILL_THERE}")
-            return
-        for each in done:
-            if each.changes:
-                self._report(each.render(done=True))
+        finally:
+            await ended(*waits)
 
     def _hear(self, event: Event) -> None:
         if self._begun and isinstance(event, VerdictChanged):
@@ -179,46 +158,14 @@ class Networks:
                 pause_s = None if due_s is None else max(due_s, _SOON_S)
 
     async def _program(self, programmer: Programmer, within_s: float | None = None) -> float | None:
-        """Program the latest flows and say what was done; return when it must be done again.
-
-        Cancelled, what is under way in the thread is cut off and waited for.
-        """
-        loop = asyncio.get_running_loop()
-
-        def say(text: str) -> None:
-            # At once: a task that is cancelled meanwhile has changed the networks all the same.
-            loop.call_soon_threadsafe(self._report, text)
-
-        async with self._one_at_a_time:
-            task = loop.run_in_executor(
-                self._thread, _once, programmer, self._flows, within_s, say, self._left_out
-            )
-            try:
-                return await asyncio.shield(task)
-            except asyncio.CancelledError:
-                programmer.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-                programmer.resume()
-                raise
-
-
-def _once(
-    programmer: Programmer,
-    flows: Sequence[FlowReport],
-    within_s: float | None,
-    say: Callable[[str], None],
-    reported: set[str],
-) -> float | None:
-    """Program flows, in a thread; return the seconds until something expires.
-
-    What was done is reported, and what is left out unless it is among `reported`.
-    """
-    until_s = None if within_s is None else time.monotonic() + within_s
-    for each in programmer.update(flows, hold=True, within_s=within_s):
-        if each.pending or not reported.issuperset(each.left_out):
-            reported.update(each.left_out)
-            say(each.render(done=True))
-    return programmer.renew(within_s=None if until_s is None else until_s - time.monotonic())
+        """Program the latest flows and say what was done; return when it must be done again."""
+        until_s = None if within_s is None else time.monotonic() + within_s
+        for each in await programmer.update(self._flows, hold=True, within_s=within_s):
+            if each.pending or not self._left_out.issuperset(each.left_out):
+                self._left_out.update(each.left_out)
+                self._report(each.render(done=True))
+        left_s = None if until_s is None else until_s - time.monotonic()
+        return await programmer.renew(within_s=left_s)
 
 
 def open_networks(
@@ -252,7 +199,7 @@ def open_networks(
     def report(text: str) -> None:
         emit(Notice(message=text))
 
-    sweep_orphans(path.parent, report, own=path.name, within_s=_SWEEP_S)
+    asyncio.run(sweep_orphans(path.parent, report, own=path.name, within_s=_SWEEP_S))
     return Networks(plan.system, path, emit, programmer)
 
 
@@ -263,6 +210,6 @@ def remove_programmed(directory: Path, within_s: float) -> None:
         ProgrammingError: something could not be removed; it stays listed.
     """
     if (directory / LEDGER_NAME).is_file():
-        from lifecycle.programming.programmer import removal_of
+        from lifecycle.programming import programmer
 
-        removal_of(directory).close(within_s=within_s)
+        asyncio.run(programmer.remove_programmed(directory, within_s=within_s))

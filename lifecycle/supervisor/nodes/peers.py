@@ -81,7 +81,7 @@ class _Peer(msgspec.Struct):
     """A supervisor that should be alive.
 
     Attributes:
-        what: for messages, "the supervisor of machine 'robot'".
+        machine: whose it is.
         nodes: fully qualified names of the nodes that are lost with it.
         watch: None once it is not followed any more.
         lost_at_s: when it was lost; None while it is not.
@@ -91,7 +91,6 @@ class _Peer(msgspec.Struct):
         unknown_since_s: since when it is there, and has not said its plan.
     """
 
-    what: str
     machine: str
     nodes: tuple[str, ...]
     watch: AliveSubscription | None = None
@@ -101,6 +100,11 @@ class _Peer(msgspec.Struct):
     clock: ClockComparison = msgspec.field(default_factory=ClockComparison)
     answered: int | None = None
     unknown_since_s: float | None = None
+
+    @property
+    def what(self) -> str:
+        """For messages."""
+        return f"the supervisor of machine {self.machine!r}"
 
 
 class Peers:
@@ -131,8 +135,7 @@ class Peers:
         remote = self._system.remote.values()
         for machine in filter(None, dict.fromkeys(each.machine for each in remote)):
             nodes = (each.full_name for each in remote if each.machine == machine)
-            what = f"the supervisor of machine {machine!r}"
-            self._supervisors.append(self._watch(_Peer(what, machine, tuple(nodes))))
+            self._supervisors.append(self._watch(_Peer(machine, tuple(nodes))))
         if remote:
             self._announcements = [
                 self._participant.announce_alive(

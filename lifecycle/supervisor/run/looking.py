@@ -136,11 +136,7 @@ def with_supervisors_numbers(seen: JudgedSystem) -> JudgedSystem:
 
 
 def follow_running(
-    plan: Plan,
-    on_change: Callable[[JudgedSystem], None],
-    *,
-    each_s: float | None = None,
-    for_s: float | None = None,
+    plan: Plan, on_change: Callable[[JudgedSystem], None], *, each_s: float | None = None
 ) -> None:
     """Judge what runs whenever it changes, and give it to `on_change`, until interrupted.
 
@@ -150,13 +146,11 @@ def follow_running(
         plan: what should run.
         on_change: takes what was seen.
         each_s: seconds, > 0, after which what is measured is a change; None if it never is.
-        for_s: seconds, > 0, after which to end; None follows for ever.
     """
 
     async def follow(participant: ObserverParticipant) -> None:
         passing, clock = Passing(), asyncio.get_running_loop().time
         last: JudgedSystem | None = None
-        until_s = clock() + (float("inf") if for_s is None else for_s)
         while True:
             seen = _judged(plan, await participant.graph.observe(plan), participant)
             verdict, _ = passing.without(seen.verdict, seen.plan, clock(), stage=Stage.ACTIVE)
@@ -164,9 +158,7 @@ def follow_running(
             before, last = last, _apart_from_numbers(seen)
             if last != before or (each_s is not None and verdict.measured):
                 on_change(seen)
-            if (left_s := until_s - clock()) <= 0:
-                return
-            await asyncio.sleep(min(each_s or _EACH_S, left_s))
+            await asyncio.sleep(each_s or _EACH_S)
 
     asyncio.run(_with_participant(plan, follow))
 

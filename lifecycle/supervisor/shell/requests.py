@@ -306,9 +306,8 @@ class Requests:
         if effect.values is None:
             planned = node.planned
             # All of them, also those that it has by default.
-            all_ = tuple(
-                replace(each, source=GIVEN) for each in planned.in_mode(self._system.run.mode)
-            )
+            given = planned.mode_parameters.get(self._system.run.mode, ())
+            all_ = tuple(replace(each, source=GIVEN) for each in given)
             giving = clients.give_parameters(replace(planned, expected_parameters=all_))
         else:
             giving = clients.set_parameters(node.name, effect.values.now, effect.values.types)

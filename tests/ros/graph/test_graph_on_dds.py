@@ -93,7 +93,16 @@ def publishers(topic: str, *nodes: str) -> Callable[[GraphState], bool]:
 
 
 def until(graph: Graph, holds: Callable[[GraphState], object]) -> None:
-    assert graph.wait_for(holds, timeout_s=LIMIT_S), graph.state.nodes()
+    found = threading.Event()
+
+    def look(*_: object) -> None:
+        if holds(graph.state):
+            found.set()
+
+    remove = graph.state.on_change(look)
+    look()
+    assert found.wait(LIMIT_S), graph.state.nodes()
+    remove()
 
 
 def test_a_node_joins_tells_its_changes_and_leaves(
@@ -111,7 +120,7 @@ def test_a_node_joins_tells_its_changes_and_leaves(
         teller = ReportingNode(node, "/told")
         until(graph, publishers("/told", "/teller"))
         # Its status comes: what was read of it says the same, and could have come before it.
-        until(graph, lambda state: (seen := state.node("/teller")) and seen.instance)
+        until(graph, lambda state: (seen := state.node("/teller")) and seen.status)
         until(graph, lambda state: (seen := state.node("/teller")) and seen.state == "inactive")
         teller.reporter.report(state="active")
         until(graph, lambda state: (seen := state.node("/teller")) and seen.state == "active")
@@ -139,7 +148,6 @@ def test_a_late_joiner_learns_what_was_before_and_both_see_the_same(
         with Graph.open(domain_id) as late:
             for number in range(5):
                 until(late, publishers(f"/early/t{number}", f"/early_{number}"))
-            until(graph, lambda state: len(state.topics()) >= 5)
             for node in nodes:
                 name = node.get_fully_qualified_name()
                 until(graph, lambda state, name=name: state.node(name))
@@ -159,7 +167,7 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
         with process("mortal", "/mortal/t") as first:
             until(graph, publishers("/mortal/t", "/mortal"))
             # Discovery may show it before its first status, without which none is missed.
-            until(graph, lambda state: (seen := state.node("/mortal")) and seen.instance)
+            until(graph, lambda state: (seen := state.node("/mortal")) and seen.status)
             born = graph.state.node("/mortal")
             assert born is not None
             os.kill(first.pid, signal.SIGKILL)
@@ -174,7 +182,7 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
                 lambda state: (
                     (seen := state.node("/mortal"))
                     and not seen.silent
-                    and seen.instance > born.instance
+                    and seen.status.instance > born.status.instance
                     and seen.configuration
                 ),
             )

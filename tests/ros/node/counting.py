@@ -7,10 +7,9 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from lifecycle_driver import Driver
 from rclpy.task import Future
-from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 
-from lifecycle import GoalInterruptedError, LifecycleNode, on_action
+from lifecycle import LifecycleNode, on_action
 from lifecycle.manifest.model import EndpointKind
 from tests.builders import planned_endpoint
 
@@ -39,11 +38,9 @@ class Counting(LifecycleNode):
         counted: list[int] = []
         for number in range(goal.request.order):
             self.go_on = Future()
-            try:
-                await self.go_on
-            except GoalInterruptedError as error:
-                self.said.append(str(error))
-                self.publisher("stop").publish(String(data="stop"))
+            await self.go_on
+            if not goal.is_active:
+                self.said.append("not active")
                 return Fibonacci.Result(sequence=counted)
             counted.append(number)
             goal.publish_feedback(Fibonacci.Feedback(sequence=counted))

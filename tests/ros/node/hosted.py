@@ -10,6 +10,7 @@ import rclpy
 from rclpy.action import ActionServer
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
+from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -42,11 +43,28 @@ class Stuck(LifecycleNode):
         await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
 
 
-class Calling(LifecycleNode):
-    """Waits in a callback for an answer that its own executor would have to bring."""
+class Late(LifecycleNode):
+    """Answers itself once its server is destroyed."""
 
-    def on_configure(self) -> None:
-        self.create_client(Trigger, "/nobody").call(Trigger.Request())
+    async def on_configure(self) -> None:
+        self.server = self.create_service(Trigger, "late", self.answer)
+        self.asked, self.gone, self.answered = Future(), Future(), Future()
+        client = self.create_client(Trigger, "late")
+        while not client.service_is_ready():
+            await self.sleep(0.01)
+        client.call_async(Trigger.Request())
+        await self.asked
+        self.destroy_service(self.server)
+        self.gone.set_result(None)
+        await self.answered
+
+    async def answer(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        self.asked.set_result(None)
+        await self.gone
+        self.answered.set_result(None)
+        return response
 
 
 class Blocking(LifecycleNode):

@@ -13,7 +13,7 @@ from planning import built_with, planned, subscription
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, on_message
-from lifecycle.node.connections import ConnectionEvent, ConnectionEventKind
+from lifecycle.graph.state import EventKind, GraphEvent
 
 UDP = "udpv4://127.0.0.1"
 
@@ -34,8 +34,9 @@ class SelfReliant(LifecycleNode):
         self.connect_to(UDP, name="net")
         self.map_to("in", "net")
 
-    def _react(self, event: ConnectionEvent) -> None:
-        if event.kind is ConnectionEventKind.CONNECTION_LOST and not event.unmade:
+    def _react(self, event: GraphEvent) -> None:
+        connection = event.connection
+        if event.kind is EventKind.CONNECTION_LOST and connection and not connection.established:
             self.lost.append(self.established())
             self.disconnect("net")
             self._instruct()

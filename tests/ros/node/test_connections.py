@@ -19,16 +19,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, codec, on_service
+from lifecycle.graph.state import EventKind, GraphEvent
 from lifecycle.manifest.model import Authority
 from lifecycle.manifest.qos import Durability
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.node import endpoint
-from lifecycle.node.connections import (
-    ConnectError,
-    ConnectionEvent,
-    ConnectionEventKind,
-    UnknownConnectionError,
-)
+from lifecycle.node import data_layer
+from lifecycle.node.connections import ConnectError, UnknownConnectionError
 from lifecycle.node.data_layer import NotConfiguredError
 from lifecycle.node.endpoint import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
@@ -56,7 +52,7 @@ class Everything(Hearing):
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is handed over has no peers that could end its patience."""
-    monkeypatch.setattr(endpoint, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(data_layer, "PATIENCE_S", 0.1)
 
 
 def configuration(driver: Driver) -> NodeConfiguration:
@@ -329,34 +325,33 @@ def test_events_tell_of_connections_and_mappings_with_their_peers(
     driver: Driver, active: Active
 ) -> None:
     node = active(Talking, publisher("out"), to="configure")
-    events: list[ConnectionEvent] = []
+    events: list[GraphEvent] = []
+    later: list[EventKind] = []
+
+    async def listen(event: GraphEvent) -> None:
+        later.append(event.kind)
+
     remove = node.on_connection_event(events.append)
+    node.on_connection_event(listen)
     node.connect_to(UDP, name="net")
     node.map_to("out", "net")
     listener = driver.node.create_subscription(String, "/out", lambda m: None, 10)
-    driver.spin_until(lambda: len(events) == 4)
+    driver.spin_until(lambda: len(events) == 3)
     driver.node.destroy_subscription(listener)
-    driver.spin_until(lambda: len(events) == 6)
+    driver.spin_until(lambda: len(events) == 5)
     node.disconnect("net")
-    driver.spin_until(lambda: len(events) == 8)
-    made, lost = "connection_established", "connection_lost"
-    mapped, unmapped = "mapping_established", "mapping_lost"
-    assert [(each.kind.value, each.endpoint, each.peers, each.unmade) for each in events] == [
-        (made, "", None, False),
-        (mapped, "publishers/out", 0, False),
-        (mapped, "publishers/out", 1, False),
-        (made, "", None, False),
-        (unmapped, "publishers/out", 0, False),
-        (lost, "", None, False),
-        (unmapped, "publishers/out", None, True),
-        (lost, "", None, True),
-    ]
-    assert {(each.connection, each.urls) for each in events} == {("net", (UDP,))}
+    driver.spin_until(lambda: len(events) == 6)
+    made, lost = EventKind.CONNECTION_ESTABLISHED, EventKind.CONNECTION_LOST
+    mapped, unmapped = EventKind.MAPPING_ESTABLISHED, EventKind.MAPPING_LOST
+    kinds = [each.kind for each in events]
+    assert kinds == [mapped, made, mapped, lost, unmapped, unmapped]
+    assert [each.mapping.matched for each in events if each.mapping] == [0, 1, 0, 0]
+    assert [each.connection.urls for each in events if each.connection] == [(UDP,)] * 2
+    driver.spin_until(lambda: set(later) == set(kinds))
     remove()
     node.connect_to(UDP, name="net")
-    driver.settle()
-    assert len(events) == 8
-    assert events[0].kind is ConnectionEventKind.CONNECTION_ESTABLISHED
+    driver.spin_until(lambda: len(later) == 7)
+    assert len(events) == 6
 
 
 def test_what_is_asked_wrongly_is_refused_with_what_is_allowed(
@@ -597,14 +592,3 @@ def test_a_name_that_cannot_be_is_refused(active: Active) -> None:
         "not contain characters other than alphanumerics, '_', '~', '{', or '}'"
     )
     assert node.mappings == (("publishers/out", ""),)
-
-
-def test_a_remap_that_a_rule_of_the_plan_would_undo_is_refused(active: Active) -> None:
-    node = active(Talking, publisher("out"), remap=(("chatter", "/there"),))
-    with pytest.raises(Exception, match="cannot ") as error:
-        node.remap("out", "/chatter")
-    assert str(error.value) == (
-        "cannot call publisher 'out' '/chatter': a remapping rule that the node was started with "
-        "makes it '/there'; take the rule out of the manifest's `remap:`, or choose another name"
-    )
-    assert node.publisher("out").entity.topic_name == "/out"

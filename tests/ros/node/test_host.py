@@ -18,11 +18,9 @@ from planning import publisher, subscription
 from rclpy.action import ActionClient
 from test_msgs.action import Fibonacci
 
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
 from lifecycle.network.ports import participant_ports
 from lifecycle.node.host.control import Event, Operation
-from lifecycle.node.host.in_process import NodeInProcess
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -135,30 +133,13 @@ def test_a_command_to_a_node_that_is_not_here_is_answered(start: Start) -> None:
     )
 
 
-BLOCKED = (
-    "cannot wait for service '/nobody' in a callback: the answer comes by the executor that waits "
-    "for this callback; write `async def` and `await client.call_async(request)`"
-)
-
-
-@pytest.mark.parametrize("executor", [Executor.SINGLE, Executor.EVENTS])
-def test_a_blocking_call_in_a_callback_is_an_error_in_whatever_executor_would_wait(
-    start: Start, executor: Executor
+def test_an_answer_that_comes_after_its_server_was_destroyed_is_lost_and_the_node_lives(
+    start: Start,
 ) -> None:
-    run = Run(kind=RunKind.PYTHON, python="hosted:Calling", executor=executor)
-    host = start(hosted("one", "Calling", run=run))
+    host = start(hosted("one", "Late"))
     host.until("ready")
-    assert host.do("/one", CONFIGURE).error == BLOCKED
-
-
-def test_a_blocking_call_is_an_error_in_a_node_of_a_test_too(fresh_domain: int) -> None:
-    node = NodeInProcess(hosted("one", "Calling"), domain_id=fresh_domain)
-    try:
-        with pytest.raises(BringUpError) as error:
-            node.change("configure")
-    finally:
-        node.close()
-    assert str(error.value) == f"cannot configure /one: {BLOCKED}"
+    assert host.do("/one", CONFIGURE).ok
+    assert host.do("/one", CONNECT).ok
 
 
 @pytest.mark.parametrize(

@@ -310,22 +310,6 @@ def test_callbacks_may_await_another_nodes_service_in_the_same_executor(
     other.destroy_node()
 
 
-def test_a_blocking_call_in_a_callback_is_an_error_and_not_a_deadlock(
-    driver: Driver, build: Build
-) -> None:
-    class Blocking(LifecycleNode):
-        def on_activate(self) -> None:
-            self.client("other").call(Trigger.Request())
-
-    node = build(Blocking, planned("it", client("other")))
-    up(driver, "configure", "connect", node="/it")
-    result = driver.run(node.lifecycle.change, "activate")
-    assert result.error == (
-        "cannot wait for service 'other' in a callback: the answer comes by the executor that "
-        "waits for this callback; write `async def` and `await client.call_async(request)`"
-    )
-
-
 def test_a_latched_sample_that_came_before_activation_is_received_at_activation(
     driver: Driver, build: Build
 ) -> None:

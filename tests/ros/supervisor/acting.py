@@ -6,22 +6,19 @@ from typing import Any
 
 from test_msgs.action import Fibonacci
 
-from lifecycle import GoalInterruptedError, LifecycleNode, on_action, on_timer
+from lifecycle import LifecycleNode, on_action, on_timer
 
 
 class Counter(LifecycleNode):
     @on_action("count")
     async def count(self, goal: Any) -> Fibonacci.Result:
         counted: list[int] = []
-        try:
-            while len(counted) < goal.request.order:
-                counted.append(len(counted))
-                goal.publish_feedback(Fibonacci.Feedback(sequence=counted))
-                await self.sleep(0.01)
-        except GoalInterruptedError:
-            print("stopped counting", flush=True)
-            raise
-        goal.succeed()
+        while len(counted) < goal.request.order and goal.is_active:
+            counted.append(len(counted))
+            goal.publish_feedback(Fibonacci.Feedback(sequence=counted))
+            await self.sleep(0.01)
+        if goal.is_active:
+            goal.succeed()
         return Fibonacci.Result(sequence=counted)
 
 

@@ -173,6 +173,21 @@ class Listener(LifecycleNode):
             print(f"heard {message.data}", flush=True)
 
 
+class Crossing(LifecycleNode):
+    """Hears of several topics, and publishes some of its own."""
+
+    @on_message("in0")
+    @on_message("in1")
+    @on_message("in2")
+    @on_message("in3")
+    @on_message("in4")
+    @on_message("in5")
+    @on_message("in6")
+    @on_message("in7")
+    def heard(self, message: String) -> None:
+        pass
+
+
 class Quiet(LifecycleNode):
     """Has what its manifest declares, and does nothing with it."""
 

@@ -105,36 +105,47 @@ def test_numbers_are_seen_fresh_by_every_way_and_fill_no_journal(
         run.finish()
 
 
+def recording(file: Path, runtime: Path) -> subprocess.Popen[str]:
+    """`lifecycle flows pair --record FILE`."""
+    return subprocess.Popen(
+        [*command("flows"), "pair", "--record", str(file)],
+        cwd=ROOT,
+        env=environment(runtime, ""),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def until_rows(file: Path, number: int) -> None:
+    """Wait until so many rows are recorded."""
+    while not file.is_file() or file.read_text().count("\n") < 1 + number:
+        time.sleep(0.05)
+
+
 def test_a_record_has_a_row_a_second_and_ends_with_its_supervisor(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     file = tmp_path / "flows.csv"
     with up(pair(tmp_path, fresh_domain, edit=DECLARED), runtime=tmp_path) as run:
         decided(run)
-        words = ("flows", "pair", "--record", str(file))
-        done = verb(*words, "--for", "3", runtime=tmp_path)
-        assert (done.returncode, done.stderr) == (ExitCode.OK, f"3 rows in {str(file)!r}\n")
-        refused = verb(*words, "--for", "3", runtime=tmp_path)
-        assert refused.returncode == ExitCode.USAGE
-        assert "it is there already" in refused.stderr
+        with recording(file, tmp_path) as records:
+            until_rows(file, 3)
+            records.send_signal(signal.SIGINT)
+            assert records.wait(20) == ExitCode.INTERRUPTED
+            assert records.stderr is not None
+            assert records.stderr.read().strip() == f"3 rows in {str(file)!r}"
         rows = list(csv.DictReader(file.read_text().splitlines()))
         assert {each["outcome"] for each in rows} == {"violated"}
         assert [round(float(each["seconds"])) for each in rows] == [0, 1, 2]
         assert float(rows[-1]["rate_hz"]) == pytest.approx(50, rel=0.2)
 
-        with subprocess.Popen(
-            [*command(words[0]), *words[1:], "--force"],
-            cwd=ROOT,
-            env=environment(tmp_path, ""),
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as recording:
-            while file.read_text().count("\n") < 2 or file.read_text().count("\n") > 3:
-                time.sleep(0.1)
+        file.unlink()
+        with recording(file, tmp_path) as records:
+            until_rows(file, 1)
             assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
-            assert recording.wait(20) == ExitCode.OK
-            assert recording.stderr is not None
-            assert "its supervisor has ended" in recording.stderr.read()
+            assert records.wait(20) == ExitCode.OK
+            assert records.stderr is not None
+            assert "its supervisor has ended" in records.stderr.read()
         run.finish()
 
 
@@ -145,8 +156,10 @@ def test_what_nobody_declares_is_counted_and_recorded_from_outside(
     with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
         run.until("system", reached="active")
         assert "measured" not in verb("status", "pair", runtime=tmp_path).stdout
-        done = verb("flows", "pair", "--record", str(file), "--for", "3", runtime=tmp_path)
-        assert done.returncode == ExitCode.OK, done.stderr
+        with recording(file, tmp_path) as records:
+            until_rows(file, 2)
+            records.send_signal(signal.SIGINT)
+            assert records.wait(20) == ExitCode.INTERRUPTED
         rows = list(csv.DictReader(file.read_text().splitlines()))
         assert len(rows) >= 2
         assert {each["outcome"] for each in rows} == {""}

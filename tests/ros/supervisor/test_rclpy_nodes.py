@@ -175,6 +175,37 @@ def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
         up.assert_gate_held()
 
 
+def test_an_events_executor_survives_that_endpoints_are_destroyed_while_peers_come_and_go(
+    fresh_domain: int, tmp_path: Path
+) -> None:
+    def crossing(there: str, back: str, published: int) -> dict[str, Any]:
+        heard = [{"name": f"in{at}", "type": _STRING} for at in range(8)]
+        said = [{"name": f"out{at}", "type": _STRING} for at in range(published)]
+        remap = {f"in{at}": f"{there}{at}" for at in range(8)}
+        remap |= {f"out{at}": f"{back}{at}" for at in range(published)}
+        made = node(
+            "tests.ros.supervisor.systems:Crossing",
+            interface={"subscriptions": heard, "publishers": said},
+            executor="events",
+        )
+        return {**made, "remap": remap}
+
+    def write(published: int) -> str:
+        nodes = {"a": crossing("x", "y", published), "b": crossing("y", "x", published)}
+        return str(running.write(tmp_path, fresh_domain, nodes))
+
+    with running.up(Path(write(9)), runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        for order, published in (("restart", 9), ("apply", 8)):
+            done = verb(order, write(published), runtime=tmp_path)
+            assert done.returncode == 0, done.stdout + done.stderr
+        assert verb("down", str(up.manifest), runtime=tmp_path).returncode == 0
+        assert up.finish() == 0, up.said()
+        ends = [each for each in up.of_kind("process") if each["state"] == "exited"]
+        assert ends
+        assert not [each for each in ends if "SIGSEGV" in str(each)]
+
+
 @pytest.mark.thorough
 def test_a_function_may_return_several_nodes_of_one_process(
     fresh_domain: int, tmp_path: Path, wait_until: Any

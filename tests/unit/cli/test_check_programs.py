@@ -62,15 +62,13 @@ def test_what_could_not_be_resolved_is_said_and_fails_only_when_strict(
     assert [each["subject"] for each in report["unresolved"]] == ["class 'talk:Made'"]
 
 
-def test_a_junit_report_has_the_same_tests_whatever_was_found(folder: Path) -> None:
-    seen = []
+def test_a_junit_report_has_the_same_test_whatever_was_found(folder: Path) -> None:
     for name, failures in (("Talker", "0"), ("Talkr", "1"), ("Made", "0")):
         main(["check", f"{name}.lifecycle.yaml", "--report", "report.xml"])
         suite = ET.parse(folder / "report.xml").getroot().find("testsuite")
         assert suite is not None
         assert (suite.get("failures"), suite.get("skipped")) == (failures, "0")
-        seen.append([each.get("name") for each in suite.findall("testcase")])
-    assert seen == [["document", "system", "plan", "programs"]] * 3
+        assert [each.get("name") for each in suite.findall("testcase")] == ["the manifest is valid"]
 
 
 def test_a_report_is_written_by_its_suffix_on_every_exit_code(

@@ -24,7 +24,6 @@ def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Chosen, ..
     """A NEF that is named in the environment's own run directory; its server is not there."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TEST_TOKEN", TOKEN)
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     return ()
 
 

@@ -45,7 +45,7 @@ def generate_launch_description():
         remappings=[("chatter", "words")], additional_env={"A": "b"},
         respawn=True, respawn_delay=2.5,
         parameters=[str(HERE / "talker.yaml"), {"rate": 5.0, "a": {"b": [1, 2]}},
-                    {"mode": LaunchConfiguration("mode")}])
+                    {"mode": LaunchConfiguration("mode"), "text": "$(x)"}])
     return LaunchDescription([
         DeclareLaunchArgument("mode", default_value="fast"),
         DeclareLaunchArgument("sim", default_value="false"),
@@ -125,6 +125,7 @@ def test_a_launch_file_is_evaluated_and_nothing_of_it_started(tmp_path: Path) ->
         "rate": 5.0,
         "a.b": (1, 2),
         "mode": "slow",
+        "text": "$(x)",
     }
     assert talker.parameter_files == (str(tmp_path / "talker.yaml"),)
     assert dict(talker.remap) == {"scan": "scan_raw", "chatter": "words"}
@@ -135,15 +136,15 @@ def test_a_launch_file_is_evaluated_and_nothing_of_it_started(tmp_path: Path) ->
     assert talker.supervision.restart_sec == 2.5
     assert dict(nodes["/late"].run.environment)["ONLY"] == "this"
     assert [node.key for node in manifest.nodes if node.managed] == ["arm"]
-    assert nodes["/real"].log_level == "warn"
     assert nodes["/part/part"].run.command[1:] == ("--fast", "3")
     assert nodes["/own"].run.command == ("/bin/own",)
     assert result.stderr.splitlines() == [
         "[INFO] [launch.user]: said to people",
         f"gap: the process 'touch {tmp_path}/STARTED' is no node: a manifest starts nodes only",
         "gap: /left/talker: launch lets talker.yaml win over parameters before it; here they win",
+        "gap: /: ROS arguments --log-level warn: see remap, parameters and log_level",
         "gap: /late: launch starts it 2 s later; `after:` says what it waits for",
-        "gap: /late: env: launch gives it these variables alone, here they are added",
+        "gap: /late: env, which are its only variables there: a manifest has nothing like it",
         "gap: /after: launch starts it on an event, OnProcessExit; `after:` says what it waits for",
     ]
 
@@ -195,24 +196,20 @@ def test_what_launch_leaves_open_is_marked(tmp_path: Path) -> None:
             LaunchedNode(
                 name="",
                 namespace="/",
-                run={"command": ["/bin/talk", "$$(date)"]},
-                managed=False,
+                keys={"run": {"command": ["/bin/talk", "$$(date)"]}},
                 gaps=["shell: a manifest has nothing like it"],
             ),
             LaunchedNode(
                 name="a",
                 namespace="/one",
-                run={"command": ["a"]},
-                managed=True,
-                parameters={"text": "$(x)", "list": ("$(y)", "on")},
-                remap={"from": "/to"},
+                keys={"run": {"command": ["a"]}, "parameters": {"on": ["yes", "$$(y)"]}},
             ),
-            LaunchedNode(name="a", namespace="/two", run={"command": ["a"]}, managed=True),
+            LaunchedNode(name="a", namespace="/two", keys={"run": {"command": ["a"]}}),
         ],
         arguments={"mode": "fast"},
         gaps=["a timer"],
     )
-    text = to_launched_manifest(found, source="x.launch.py", system="x", folder=tmp_path)
+    text = to_launched_manifest(found, source="x.launch.py", system="x")
     path = tmp_path / "x.lifecycle.yaml"
     path.write_text(text)
     manifest = load(path).manifest
@@ -222,7 +219,7 @@ def test_what_launch_leaves_open_is_marked(tmp_path: Path) -> None:
         ("two_a", "a", "/two"),
     ]
     assert manifest.nodes[0].run.command == ("/bin/talk", "$(date)")
-    assert dict(manifest.nodes[1].parameters) == {"text": "$(x)", "list": ("$(y)", "on")}
+    assert dict(manifest.nodes[1].parameters) == {"on": ("yes", "$(y)")}
     first = "launch leaves its name to its code; the key must be that name"
     assert text.splitlines()[:11] == [
         "# yaml-language-server: $schema=manifest.v1.schema.json",

@@ -168,7 +168,7 @@ def test_a_summary_counts_the_flows_with_declared_numbers_and_names_the_worst_fi
 
 def test_a_record_has_a_row_for_each_flow_that_is_on_disk_at_once(tmp_path: Path) -> None:
     path = tmp_path / "flows.csv"
-    record = Record(path, replaces=False)
+    record = Record(path)
     assert path.read_text() == ",".join(RECORDED) + "\n"
     unknown = replace(measured(), lost=None, p50_ms=None, p99_ms=None)
     record.add([measured(LATE, LOSES), unknown])
@@ -184,17 +184,12 @@ def test_a_record_has_a_row_for_each_flow_that_is_on_disk_at_once(tmp_path: Path
     record.close()
 
 
-def test_a_record_replaces_a_file_only_if_asked_and_says_why_it_cannot_be_written(
-    tmp_path: Path,
-) -> None:
+def test_a_record_replaces_a_file_and_says_why_it_cannot_be_written(tmp_path: Path) -> None:
     path = tmp_path / "flows.csv"
     path.write_text("kept")
-    with pytest.raises(UsageError, match=r"it is there already; name another file, or .* --force"):
-        Record(path, replaces=False)
-    assert path.read_text() == "kept"
-    Record(path, replaces=True).close()
+    Record(path).close()
     assert path.read_text() == ",".join(RECORDED) + "\n"
     with pytest.raises(UsageError, match=r"cannot write .*/none/flows.csv': No such file"):
-        Record(tmp_path / "none" / "flows.csv", replaces=False)
+        Record(tmp_path / "none" / "flows.csv")
     with pytest.raises(UsageError, match="cannot write '/dev/full': No space left on device"):
-        Record(Path("/dev/full"), replaces=True)
+        Record(Path("/dev/full"))

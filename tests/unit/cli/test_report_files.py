@@ -140,19 +140,6 @@ def test_nothing_old_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
     assert failure.get("message") == "it never came to its end: the process was killed"
 
 
-def test_a_pipe_is_written_once_in_the_end(tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    os.mkfifo(path)
-    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    open_report(path)
-    with ReportFile(path) as report:
-        report.begin(PLAN)
-        report.end(violated())
-    text = os.read(reader, 1 << 20).decode()
-    os.close(reader)
-    assert json.loads(text)["verdict"] == "violated"
-
-
 ENDS: list[tuple[BaseException, int, str]] = [
     (UsageError("cannot run machine 'x'"), 2, "cannot run machine 'x'"),
     (click.UsageError("no such option"), 2, "no such option"),

@@ -466,9 +466,6 @@ def test_what_diagnostics_call_an_entry_is_taken_by_the_letter() -> None:
     clients.diagnose([("lidar f: status", 2, "of another"), ("lidar [front]: rpm", 2, "")])
     bad = HealthReport(ok=False, message="'lidar [front]: rpm' has level ERROR")
     assert readings.reports() == {"/lidar": bad}
-    clients.diagnose([("lidar [front]: rpm", 7, "odd")])
-    odd = "'lidar [front]: rpm' has level 7, which has no meaning: odd"
-    assert readings.reports() == {"/lidar": HealthReport(ok=None, message=odd)}
     # Another process comes in its place: what was said of the last one is not said of it.
     readings.forget("/lidar")
     assert readings.reports() == {}

@@ -266,6 +266,42 @@ def test_a_rate_may_have_an_upper_bound() -> None:
     assert verdict(Bound(kind=Kind.RATE, most=20.0), counted([], until_s=2)) is True
 
 
+def test_a_slow_maximum_is_decided_within_7_s() -> None:
+    slow = Bound(kind=Kind.RATE, most=0.5)
+    assert verdict(slow, counted(steady(0.25, 6.5), until_s=6.5)) is None
+    assert judge(slow, counted([], until_s=4)).decides_in_s == 3
+    assert verdict(slow, counted(steady(0.25, 7), until_s=7)) is True
+    assert verdict(slow, counted([], until_s=7)) is True
+    # A run waits for 10 s at most.
+    assert judge(slow, Sample(seconds=0.0), publishes_s=0.0).decides_in_s == 8
+    assert verdict(slow, counted([], until_s=7), publishes_s=7.5) is None
+    assert verdict(slow, counted([], until_s=7), publishes_s=8) is True
+    # Too many for the whole time are too many before it is over, but for a burst at its begin.
+    assert verdict(slow, counted(steady(1, 6), until_s=6)) is False
+    assert verdict(slow, counted(steady(10, 2), until_s=2)) is False
+    assert verdict(slow, counted(steady(10, 1.5), until_s=1.5)) is None
+    assert verdict(slow, counted(steady(10, 0.5), until_s=40)) is True
+    # What 7 s do not show, 20 periods do.
+    assert verdict(slow, counted(steady(0.6, 8), until_s=7)) is True
+    found = judge(slow, counted(steady(0.6, 40), until_s=40))
+    assert (found.kept, found.observed, found.allowed) == (False, "0.6 Hz", "> 0.5 Hz")
+    # A minimum beside it takes its time, and may be kept while the maximum is not.
+    both = Bound(kind=Kind.RATE, least=0.5, most=1.0)
+    assert verdict(both, counted(steady(0.7, 20), until_s=20)) is None
+    assert verdict(both, counted(steady(2, 10.5), until_s=10.5)) is False
+
+
+@given(st.sampled_from([0.05, 0.1, 0.5, 1.0, 3.0]), st.randoms(use_true_random=False))
+def test_a_maximum_raises_no_alarm_at_its_very_rate_with_messages_that_are_late(
+    most: float, chance: random.Random
+) -> None:
+    late = [(number + chance.uniform(0, 0.4)) / most for number in range(round(100 * most))]
+    for until_s in (7, 37, 100):
+        arrived = [(at_s, 1.0, number) for number, at_s in enumerate(late, 1) if at_s < until_s]
+        sample = counted(arrived, until_s=until_s)
+        assert verdict(Bound(kind=Kind.RATE, most=most), sample) is not False
+
+
 def test_a_publisher_that_was_activated_just_now_has_no_rate_yet_and_is_not_silent() -> None:
     sample = counted(steady(15, 2), until_s=60)
     assert verdict(RATE, sample) is False
@@ -371,7 +407,7 @@ def test_a_judgement_has_what_share_of_the_bound_was_measured(
         (DELAY, 2, 4.5, None, 0.5),
         (RATE, 15, 1.5, None, 1.0),
         (Bound(kind=Kind.RATE, least=1.0), 1, 5, None, 15.0),
-        (RATE, 15, 60, 1.0, 3.0),
+        (RATE, 15, 60, 1.0, 2.0),
         (LOSS, 100, 5, None, 5.0),
         (LOSS, 0.1, 1, None, 0.0),
         (LOSS, 4, 5, None, 245.0),

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import pytest
 
+from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.model import (
-    Authority,
-    ConnectionDeclaration,
-    DataLayer,
-    DataLayerSource,
     Discovery,
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
     FlowTransport,
     Manifest,
-    Node,
     Run,
     RunKind,
 )
-from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan, check_plan
-from lifecycle.plan.model import PlanError
-from tests.builders import at, endpoint, manifest, need, node, planned, publisher, subscription
+from tests.builders import manifest, need, node, planned, publisher, subscription
 
 TRIGGER = "std_srvs/srv/Trigger"
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
@@ -32,94 +26,6 @@ STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
 def said(system: Manifest) -> list[str]:
     """What `check` says of a system's plan."""
     return [str(each) for each in check_plan(system, environment={})]
-
-
-def connection(url: str, kind: EndpointKind, name: str) -> ConnectionDeclaration:
-    """One declared connection that carries one endpoint."""
-    return ConnectionDeclaration(name="net", urls=(parse(url),), map=((kind, name),), at=at(25))
-
-
-def caller_and_called(*urls: str, kinds: tuple[EndpointKind, EndpointKind]) -> list[Node]:
-    """A client and a server, each on a connection where a URL is given."""
-    return [
-        node(
-            name,
-            endpoint(kind, "/reset", TRIGGER),
-            connections=(connection(url, kind, "/reset"),) if url else (),
-        )
-        for name, kind, url in zip(("caller", "called"), kinds, urls, strict=True)
-    ]
-
-
-SERVICE = (EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER)
-ACTION = (EndpointKind.ACTION_CLIENT, EndpointKind.ACTION_SERVER)
-IN_MEMORY = Discovery(mode=DiscoveryMode.STATIC, transport=FlowTransport.SHM)
-
-
-@pytest.mark.parametrize(("kinds", "word"), [(SERVICE, "service"), (ACTION, "action")])
-def test_both_ends_of_a_service_or_an_action_need_a_transport_in_common(
-    kinds: tuple[EndpointKind, EndpointKind], word: str
-):
-    nodes = caller_and_called("", "udpv4://127.0.0.1:9001?multicast=off", kinds=kinds)
-    assert said(manifest(*nodes, discovery=IN_MEMORY)) == [
-        (
-            f"robot.lifecycle.yaml:10:9: cannot call {word} '/reset' of 'called' from 'caller': "
-            "the client's participant has shm, the server's udpv4, and they are on one host; map "
-            "both ends onto connections that have a transport in common"
-        )
-    ]
-
-
-@pytest.mark.parametrize(
-    "urls",
-    [
-        ("", ""),
-        ("shm://", ""),
-        ("udpv4://127.0.0.1:9001?multicast=off", "udpv4://127.0.0.1:9004?multicast=off"),
-    ],
-)
-def test_ends_that_have_one_are_fine(urls: tuple[str, str]):
-    nodes = caller_and_called(*urls, kinds=SERVICE)
-    assert said(manifest(*nodes, discovery=IN_MEMORY)) == []
-
-
-def _needy(enforce: bool = True) -> list[Node]:
-    return [
-        node(
-            "camera",
-            publisher("video"),
-            needs=[need(EndpointKind.PUBLISHER, "video", dscp=46, enforce=enforce)],
-        ),
-        node(
-            "viewer",
-            subscription("video"),
-            needs=[need(EndpointKind.SUBSCRIPTION, "video", STRICTLY)],
-        ),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("discovery", "has"),
-    [(Discovery(mode=DiscoveryMode.SERVER), "tcpv4"), (IN_MEMORY, "shm")],
-)
-def test_marks_and_ports_of_ones_own_need_udp(discovery: Discovery, has: str):
-    mark = (
-        "robot.lifecycle.yaml:10:9: cannot mark publisher 'video' of 'camera' EF = DSCP 46 = TOS "
-        f"184 (0xb8): its participant has {has}, and only UDP sockets can be marked; use "
-        "'transport: udpv4', or remove the mark"
-    )
-    port = (
-        "robot.lifecycle.yaml:10:9: cannot give subscription 'video' of 'viewer' a port of its "
-        f"own: its participant has {has}, and only UDP has one port for each subscription; use "
-        "'transport: udpv4', or remove 'unique'"
-    )
-    assert said(manifest(*_needy(), discovery=discovery)) == [mark, port]
-    assert said(manifest(*_needy(enforce=False), discovery=discovery)) == [port]
-
-
-def test_what_is_negotiated_while_the_system_runs_is_not_judged_before():
-    layer = DataLayer(authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC)
-    assert said(manifest(*_needy(), discovery=IN_MEMORY, data_layer=layer)) == []
 
 
 def test_every_pair_that_cannot_be_connected_is_said_at_its_publisher():
@@ -144,7 +50,7 @@ def test_every_pair_that_cannot_be_connected_is_said_at_its_publisher():
         for line, topic in ((12, "audio"), (11, "video"))
     ]
     assert said(system) == lines
-    with pytest.raises(PlanError) as raised:
+    with pytest.raises(ManifestError) as raised:
         build_plan(system, environment={})
     assert [str(each) for each in raised.value.diagnostics] == lines
 

@@ -9,19 +9,18 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Severity
-from lifecycle.manifest.model import EndpointKind, Health, Position, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, Position, Run, RunKind
 from lifecycle.plan.programs import Resolution, resolve_programs
 from tests.builders import endpoint, manifest, node, publisher, subscription
 
 TALKER = """
 from lifecycle import LifecycleNode, on_message, on_service, on_action, on_goal, on_timer
 raise SystemExit("this was run")
-ORDERS = "orders"
 class Talker(LifecycleNode):
     @on_timer(period_s=1)
     def tick(self):
         self.publisher("chatter").publish(1)
-    @on_message(ORDERS)
+    @on_message("orders")
     def take(self, message): ...
 """
 COMPLETE = (publisher("chatter"), subscription("orders"))
@@ -72,8 +71,6 @@ def test_a_class_with_all_its_handlers_is_found_and_nothing_is_run(folder: Path)
             "talk:Talkr",
             "cannot find class 'Talkr' in talk (talk.py); it has Talker; did you mean 'Talker'?",
         ),
-        ("talk.more:Talker", "cannot import 'talk.more': 'talk' is no package (talk.py)"),
-        ("pkg.none:Talker", "cannot find module 'pkg.none'; looked in pkg"),
         (
             "pkg.mod:Plain",
             (
@@ -81,30 +78,24 @@ def test_a_class_with_all_its_handlers_is_found_and_nothing_is_run(folder: Path)
                 "it from lifecycle.LifecycleNode, or from rclpy.node.Node"
             ),
         ),
-        (
-            "pkg.mod:helper",
-            (
-                "cannot host the nodes of 'helper': it calls rclpy.spin (pkg/mod.py:2), which "
-                "their host does; name the node's class, or a function that returns nodes without "
-                "spinning them"
-            ),
-        ),
         ("broken:Talker", "cannot import 'broken': broken.py:1: invalid syntax"),
-        ("talk", "cannot read 'talk'; write package.module:Class"),
     ],
 )
 def test_what_python_would_refuse_is_an_error(folder: Path, reference: str, message: str) -> None:
     write(folder, talk=TALKER, broken="class class")
     (folder / "pkg").mkdir()
     (folder / "pkg" / "__init__.py").write_text("from . import mod\n")
-    (folder / "pkg" / "mod.py").write_text("class Plain: ...\ndef helper(): rclpy.spin(Plain())\n")
+    (folder / "pkg" / "mod.py").write_text("class Plain: ...\n")
     found = [line.replace(f"{folder}/", "") for line in said(python(reference))]
     assert found == [message]
 
 
-def test_a_module_that_is_nowhere_says_where_it_is_looked_for(folder: Path) -> None:
-    assert said(python("nowhere.nodes:Talker")) == [
-        f"cannot find module 'nowhere'; it is looked for in {folder} and in what is installed"
+@pytest.mark.parametrize("module", ["nowhere.nodes", "talk.more", "pkg.none"])
+def test_a_module_that_is_nowhere_says_where_it_is_looked_for(folder: Path, module: str) -> None:
+    write(folder, talk=TALKER)
+    (folder / "pkg").mkdir()
+    assert said(python(f"{module}:Talker")) == [
+        f"cannot find module '{module}'; it is looked for in {folder} and in what is installed"
     ]
 
 
@@ -126,8 +117,8 @@ def test_names_are_followed_through_imports(folder: Path, init: str) -> None:
     assert python("pkg:Talker", *COMPLETE) == Resolution()
     assert said(python("pkg:Talker", publisher("chatter"))) == [
         (
-            "cannot use handler Talker.take (pkg/talker.py:10): @on_message('orders') names no "
-            "subscription that 'talker' declares; declared: none"
+            "cannot use handler @on_message('orders') (pkg/talker.py:8): 'talker' declares no "
+            "subscription 'orders'; declared: none"
         )
     ]
 
@@ -156,7 +147,7 @@ def test_what_only_running_would_tell_is_named(folder: Path, text: str) -> None:
 
 def test_a_compiled_module_is_named(folder: Path) -> None:
     (folder / "fast.abi3.so").write_bytes(b"")
-    assert said(python("fast:Talker")) == ["? class 'fast:Talker': fast is compiled"]
+    assert said(python("fast:Talker")) == ["? class 'fast:Talker': fast is not written in Python"]
 
 
 SLIPS = """
@@ -206,9 +197,7 @@ def test_handlers_and_endpoints_are_paired_as_at_run_time(folder: Path) -> None:
         "class Talker(Base):\n"
         "    def take(self, message): ...\n"  # inherits what it overrides
         "    @on_service('reset')\n"
-        "    def reset(self, request, response): self.publisher('chater')\n"
-        "    @on_service('reset')\n"
-        "    def again(self, request, response): self.client('plan')\n"
+        "    def reset(self, request, response): ...\n"
         "    @on_goal('dock')\n"
         "    def may(self, goal): ...\n"
     )
@@ -230,20 +219,8 @@ def test_handlers_and_endpoints_are_paired_as_at_run_time(folder: Path) -> None:
             "@on_message('order')"
         ),
         (
-            "cannot tell what self.client('plan') (talk.py:16) is to get: 'talker' declares no "
-            "service client 'plan'; declared: none"
-        ),
-        (
-            "cannot tell what self.publisher('chater') (talk.py:14) is to get: 'talker' declares "
-            "no publisher 'chater'; did you mean 'chatter'? declared: 'chatter'"
-        ),
-        (
-            "cannot use handler Base.take (talk.py:10): @on_message('orders') names no "
-            "subscription that 'talker' declares; did you mean 'order'? declared: 'order'"
-        ),
-        (
-            "cannot use two handlers of service server 'reset': Talker.reset (talk.py:14) and "
-            "Talker.again (talk.py:16)"
+            "cannot use handler @on_message('orders') (talk.py:8): 'talker' declares no "
+            "subscription 'orders'; did you mean 'order'? declared: 'order'"
         ),
     ]
 
@@ -287,11 +264,9 @@ def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
         )
     ]
     assert said(command("bin/talkr")) == [
-        f"cannot find program 'bin/talkr' in '{folder}'; did you mean 'talk'?"
+        f"cannot find program 'talkr' in '{folder}/bin'; did you mean 'talk'?"
     ]
-    assert said(command("bin/listen")) == [
-        "cannot run 'bin/listen': it is not executable; chmod +x bin/listen"
-    ]
+    assert said(command("bin/listen")) == ["cannot run 'bin/listen': it is not executable"]
     assert said(command(sys.executable, "talk.py")) == [
         f"cannot find script 'talk.py' in '{folder}'"
     ]
@@ -353,21 +328,9 @@ def both(word): return [Plain(word), Managed("m")]
                 "it is held by its executor until the system is verified"
             ),
         ),
-        (
-            "Plain",
-            False,
-            {"device": "/dev/null", "rat": 5},
-            "cannot give Plain (them.py) an argument 'rat'; did you mean 'rate'?",
-        ),
-        (
-            "both",
-            False,
-            {},
-            "cannot call both (them.py) without word; give it under 'run: {arguments: …}'",
-        ),
     ],
 )
-def test_how_a_class_of_others_is_called_is_checked(
+def test_a_class_of_others_is_managed_as_it_can_be(
     folder: Path, name: str, managed: bool, arguments: dict[str, str], message: str
 ) -> None:
     write(folder, them=FOREIGN)
@@ -387,60 +350,6 @@ def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -
     at = Position(file=str(folder / "src" / "them.lifecycle.yaml"), line=1, column=1)
     beside = replace(node("talker", run=run), at=at)
     assert said(resolve_programs(manifest(beside), environment={})) == []
-
-
-_CLASSES = """
-from lifecycle import LifecycleNode
-from rclpy.lifecycle import LifecycleNode as Theirs
-from elsewhere import Mixin
-class Deaf(LifecycleNode): pass
-class Method(LifecycleNode):
-    async def health(self): ...
-class Inherits(Method): pass
-class Assigned(LifecycleNode):
-    health = Method.health
-class Conditional(LifecycleNode):
-    if True:
-        def health(self): ...
-class Inner(LifecycleNode):
-    def on_configure(self, state):
-        def health(): ...
-class Unknown(Mixin, LifecycleNode): pass
-class Rclpy(Theirs):
-    def health(self): ...
-def made(): return []
-"""
-
-
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("Deaf", "Deaf (health.py) has no method 'health'"),
-        ("Inner", "Inner (health.py) has no method 'health'"),
-        ("Rclpy", "Rclpy (health.py) is not a lifecycle.LifecycleNode"),
-        ("Theirs", "Theirs (rclpy) is not a lifecycle.LifecycleNode"),
-        *((each, "") for each in ("Method", "Inherits", "Assigned", "Conditional", "Unknown")),
-        ("made", ""),  # which nodes a function returns only running it shows
-    ],
-)
-def test_a_class_that_cannot_say_how_it_is_is_not_to_be_asked(
-    folder: Path, name: str, why: str
-) -> None:
-    write(folder, health=_CLASSES)
-    run = Run(kind=RunKind.PYTHON, python=f"health:{name}")
-    for health in (None, Health(diagnostics=("lidar",))):
-        asked = manifest(node("lidar", run=run, health=health))
-        assert not any(
-            each.rule == "program.health"
-            for each in resolve_programs(asked, environment={}).diagnostics
-        )
-    asked = manifest(node("lidar", run=run, health=Health(check=True)))
-    found = [
-        each.message
-        for each in resolve_programs(asked, environment={}).diagnostics
-        if each.rule == "program.health"
-    ]
-    assert found == ([f"cannot ask 'lidar' whether it is healthy: {why}"] if why else [])
 
 
 def test_a_class_is_found_in_nested_folders_without_an_init(folder: Path) -> None:

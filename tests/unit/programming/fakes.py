@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from lifecycle.programming.host import Output
 from lifecycle.programming.rules import FlowRule
@@ -19,7 +21,7 @@ class FakeTarget:
         self.fails = ""
         self.due_s: float | None = None
 
-    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+    async def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         before = {each.key: each for each in self.rules}
         changes = []
         for each in rules:
@@ -30,18 +32,36 @@ class FakeTarget:
         changes += [FlowChange(kind=ChangeKind.DELETE, key=key, what="") for key in before]
         return TargetChanges(target=self.name, changes=tuple(changes))
 
-    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+    async def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         self.applied += 1
         if self.fails:
             raise ProgrammingError(self.fails)
-        changes, self.rules = self.plan(rules), tuple(rules)
+        changes, self.rules = await self.plan(rules), tuple(rules)
         return changes
 
-    def remove(self) -> TargetChanges:
-        return self.apply(())
+    async def remove(self) -> TargetChanges:
+        return await self.apply(())
 
-    def renew(self) -> float | None:
+    async def renew(self) -> float | None:
         return self.due_s
+
+
+class Waited:
+    """A target, a programmer or a ledger whose coroutines are waited for."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.real, name)
+        if not callable(found):
+            return found
+
+        def call(*args: Any, **given: Any) -> Any:
+            done = found(*args, **given)
+            return asyncio.run(done) if asyncio.iscoroutine(done) else done
+
+        return call
 
 
 class FakeTool:
@@ -56,7 +76,7 @@ class FakeTool:
         self.answers = dict(answers)
         self.lines: list[str] = []
 
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
+    async def run(self, argv: Sequence[str], *, stdin: str = "") -> Output:
         line = " ".join(argv)
         self.lines.append(line)
         for begins, answer in self.answers.items():

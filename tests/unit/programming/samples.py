@@ -10,6 +10,7 @@ from lifecycle.network.nfe import TransportProtocol
 from lifecycle.programming.ledger import Ledger
 from lifecycle.programming.rules import FlowRule, RuleSet
 from lifecycle.programming.target import Means, Target
+from lifecycle.run_directory import private_directory
 
 
 def rule(
@@ -38,10 +39,10 @@ def rule(
 
 def ledger_in(path: Path, system: str = "robot") -> Ledger:
     """A ledger of its own, with its directory made."""
-    ledger = Ledger(path / "run" / f"{system}@7", system)
-    with ledger.locked():
-        pass
-    return ledger
+    directory = path / "run" / f"{system}@7"
+    for each in (directory.parent, directory):
+        private_directory(each)
+    return Ledger(directory, system)
 
 
 def exported(

@@ -6,6 +6,7 @@ answer by answer; the NEF one against the fields of TS 29.122 and the filters of
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import datetime as dt
 import functools
@@ -13,18 +14,18 @@ import http.server
 import json
 import re
 import threading
+import types
 import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from openapi_core import OpenAPI
 from openapi_core.datatypes import RequestParameters
 from openapi_core.exceptions import OpenAPIError
 from werkzeug.datastructures import Headers, ImmutableMultiDict
-
-from lifecycle.programming.target import Patience
 
 CAMARA = Path(__file__).parents[2] / "data" / "camara" / "quality-on-demand.yaml"
 TOKEN = "s3cr3t-t0ken-0f-the-t3sts"
@@ -52,25 +53,25 @@ class Answer:
     type: str = "application/json"
 
 
-class Clock(Patience):
-    """Time that passes only while somebody sleeps."""
+class Clock:
+    """Time that passes only while targets sleep; `is_set_s` is what the wall clock was set by."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1_700_000_000.0
         self.is_set_s = 0.0
         self.slept: list[float] = []
+        really = asyncio.sleep
 
-    def now_s(self) -> float:
-        return self.now + self.is_set_s
+        async def sleep(seconds: float) -> None:
+            if seconds > 0:
+                self.slept.append(seconds)
+                self.now += seconds
+            await really(0)
 
-    def steady_s(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        assert not self.cancelled.is_set()
-        self.slept.append(seconds)
-        self.now += seconds
+        wall = types.SimpleNamespace(time=lambda: self.now + self.is_set_s)
+        monkeypatch.setattr(asyncio, "sleep", sleep)
+        monkeypatch.setattr("lifecycle.programming.camara.steady_s", lambda: self.now)
+        monkeypatch.setattr("lifecycle.programming.camara.time", wall)
 
 
 class Server:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from lifecycle.programming import ledger as ledger_module
 from lifecycle.programming.ledger import Entry, Ledger, LedgerFile, TargetRecord, owner_is_dead
 from lifecycle.programming.programmer import (
     Programmer,
-    removal_of,
+    remove_programmed,
     route_source,
     route_sources,
     sweep_orphans,
@@ -28,14 +29,14 @@ from lifecycle.programming.target import (
 )
 from lifecycle.verify.outcome import Outcome
 from tests.builders import nfe
-from tests.unit.programming.fakes import FakeTarget
+from tests.unit.programming.fakes import FakeTarget, Waited
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import ledger_in, nef_settings, rule, settings_file
-from tests.unit.programming.servers import Answer, NefServer
+from tests.unit.programming.servers import NefServer
 
 
-def programmer(tmp_path: Path, *targets: FakeTarget) -> Programmer:
-    return Programmer(plan(), targets, Means(ledger_in(tmp_path)))
+def programmer(tmp_path: Path, *targets: FakeTarget) -> Waited:
+    return Waited(Programmer(plan(), targets, Means(ledger_in(tmp_path))))
 
 
 def test_flows_are_programmed_once_and_again_only_when_they_change(tmp_path: Path) -> None:
@@ -98,61 +99,21 @@ def test_while_a_node_restarts_its_rule_is_held_and_then_moved(tmp_path: Path) -
     assert target.rules == ()
 
 
-@pytest.mark.parametrize("first_fails", [False, True])
-def test_a_rule_is_held_although_a_target_failed_meanwhile(
-    tmp_path: Path, *, first_fails: bool
-) -> None:
-    operator, other = FakeTarget("operator"), FakeTarget("other")
-    programs = programmer(tmp_path, operator, other)
+def test_a_rule_is_held_although_a_target_failed_meanwhile(tmp_path: Path) -> None:
+    target = FakeTarget()
+    programs = programmer(tmp_path, target)
+    programs.update([report()], hold=True)
     unsure = report(outcome=Outcome.VIOLATED, source=())
-    if first_fails:
-        other.fails = "out of reach"
-        with pytest.raises(PartlyError):
-            programs.update([report()], hold=True)
-    else:
-        programs.update([report()], hold=True)
-        programs.update([unsure], hold=True)
-        operator.fails = other.fails = "out of reach"
-        with pytest.raises(PartlyError):
-            programs.update([report(source=(nfe("0.0.0.0", 46000),))], hold=True)
-        operator.fails = ""
-        with pytest.raises(PartlyError):
-            programs.update([unsure], hold=True)
-    held = operator.rules
-    other.fails = ""
+    target.fails = "out of reach"
+    with pytest.raises(ProgrammingError):
+        programs.update([report(source=(nfe("0.0.0.0", 46000),))], hold=True)
+    target.fails = ""
+
     programs.update([unsure], hold=True)
 
-    assert [each.source_port for each in held] == [45000]
-    assert operator.rules == other.rules == held
+    assert [each.source_port for each in target.rules] == [46000]
     programs.update([], hold=True)
-    assert operator.rules == other.rules == ()
-
-
-def test_what_no_target_took_is_not_held(tmp_path: Path) -> None:
-    target = FakeTarget()
-    target.fails = "out of reach"
-    programs = programmer(tmp_path, target)
-    with pytest.raises(ProgrammingError):
-        programs.update([report()], hold=True)
-    target.fails = ""
-    programs.update([report(outcome=Outcome.VIOLATED)], hold=True)
     assert target.rules == ()
-
-
-def test_what_a_server_took_a_part_of_is_held(tmp_path: Path) -> None:
-    targets = Means(ledger_in(tmp_path))
-    with NefServer() as server:
-        settings = nef_settings(server.url, devices=["0.0.0.0/0"])
-        options = read_targets(["nef"], {"config": settings_file(tmp_path, nef=settings)})[0]
-        programs = Programmer(plan(), [options.open(targets)], targets)
-        server.failures.append(("POST", Answer(status=400)))
-        with pytest.raises(PartlyError):
-            programs.update([report()], hold=True)
-        assert len(server.subscriptions) == 1
-
-        programs.update([report(outcome=Outcome.VIOLATED, source=())], hold=True)
-
-        assert len(server.subscriptions) == 2
 
 
 def test_without_hold_an_unverified_flow_loses_its_rule(tmp_path: Path) -> None:
@@ -254,9 +215,13 @@ def test_two_processes_never_program_one_system_at_once(
     ledger = ledger_in(tmp_path)
     monkeypatch.setattr(ledger_module, "_LOCK_S", 0.0)
 
-    with ledger.locked(), pytest.raises(ProgrammingError, match="another process"):  # noqa: SIM117
-        with Ledger(tmp_path / "run" / "robot@7", "robot").locked():
-            pass
+    async def twice() -> None:
+        async with ledger.locked():
+            with pytest.raises(ProgrammingError, match="another process"):
+                async with Ledger(tmp_path / "run" / "robot@7", "robot").locked():
+                    pass
+
+    asyncio.run(twice())
 
 
 def test_a_ledger_of_a_living_supervisor_is_no_orphan_and_of_a_dead_one_is(
@@ -283,7 +248,7 @@ def orphan(tmp_path: Path, server: NefServer, *, dead: bool) -> Path:
     directory = tmp_path / "run" / "robot@7"
     owned = Ledger(directory, "robot", owned=dead)
     targets = Means(owned)
-    read_targets(["nef"], {"config": file})[0].open(targets).apply([rule()])
+    Waited(read_targets(["nef"], {"config": file})[0].open(targets)).apply([rule()])
     if dead:
         written = ledger.read()
         assert written.owner is not None
@@ -299,7 +264,7 @@ def test_what_a_dead_run_left_at_a_server_is_swept_by_the_next(tmp_path: Path) -
 
         reports: list[str] = []
 
-        sweep_orphans(directory.parent, reports.append)
+        asyncio.run(sweep_orphans(directory.parent, reports.append))
 
         assert [each.partition("\n")[0] for each in reports] == [
             (
@@ -317,9 +282,9 @@ def test_what_somebody_applied_by_hand_is_not_swept_but_goes_down_with_the_syste
     with NefServer() as server:
         directory = orphan(tmp_path, server, dead=False)
 
-        sweep_orphans(directory.parent, pytest.fail)
+        asyncio.run(sweep_orphans(directory.parent, pytest.fail))
         assert len(server.subscriptions) == 1
-        removal_of(directory).close()
+        asyncio.run(remove_programmed(directory))
         assert server.subscriptions == {}
 
 
@@ -332,7 +297,7 @@ def test_an_orphan_that_cannot_be_removed_is_told_and_stays_listed(
 
         reports: list[str] = []
 
-        sweep_orphans(directory.parent, reports.append)
+        asyncio.run(sweep_orphans(directory.parent, reports.append))
 
         assert "environment variable TEST_TOKEN: it is empty or not set" in reports[0]
         assert (directory / "programmed.json").exists()

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import UsageError
+from lifecycle.programming.camara import CamaraSettings
 from lifecycle.programming.http import Token, load_settings
 from lifecycle.programming.ledger import TargetRecord
 from lifecycle.programming.nef import NefSettings
@@ -28,9 +29,9 @@ nef:
 def test_yaml_and_json_are_read_alike(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text(NEF_YAML)
-    of_yaml = load_settings(file)["nef"]
+    of_yaml = load_settings(file, "nef", NefSettings)
     same = nef_settings("https://nef.example.net", token={"file": "token.txt"})
-    of_json = load_settings(settings_file(tmp_path, nef=same))["nef"]
+    of_json = load_settings(settings_file(tmp_path, nef=same), "nef", NefSettings)
 
     assert of_yaml == of_json
     assert isinstance(of_yaml, NefSettings)
@@ -67,7 +68,7 @@ def test_what_is_not_allowed_is_refused_where_it_stands(
     file = settings_file(tmp_path, nef={**nef_settings("https://nef.example.net"), **changed})
 
     with pytest.raises(SettingsError) as caught:
-        load_settings(file)
+        load_settings(file, "nef", NefSettings)
 
     (key,) = changed
     inside = {"token": "nef.token", "qos_references": "a key of nef.qos_references"}
@@ -81,7 +82,7 @@ def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Pa
     file.write_text("nef: {token: hunter2\n  x: [")
 
     with pytest.raises(SettingsError) as caught:
-        load_settings(file)
+        load_settings(file, "nef", NefSettings)
 
     assert str(caught.value).startswith(f"cannot read settings {str(file)!r}: no YAML at line 2")
     assert "hunter2" not in str(caught.value)
@@ -89,7 +90,7 @@ def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Pa
 
 def test_a_file_that_is_not_there_is_one_clear_error() -> None:
     with pytest.raises(SettingsError) as caught:
-        load_settings("/nowhere/targets.yaml")
+        load_settings("/nowhere/targets.yaml", "nef", NefSettings)
 
     assert str(caught.value) == (
         "cannot read settings '/nowhere/targets.yaml': No such file or directory"
@@ -182,7 +183,7 @@ def test_the_settings_in_the_documentation_can_be_used(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text(page.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0])
 
-    settings = load_settings(file)
-
-    assert set(settings) == {"nef", "camara"}
-    assert settings["camara"].token == Token(file=str(tmp_path / "camara.token"))
+    assert load_settings(file, "nef", NefSettings) is not None
+    settings = load_settings(file, "camara", CamaraSettings)
+    assert settings is not None
+    assert settings.token == Token(file=str(tmp_path / "camara.token"))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import asyncio
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.host import HostTool, Output, demand
+from lifecycle.programming.host import HostTool, demand
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.target import (
     ChangeKind,
@@ -19,16 +19,10 @@ from lifecycle.programming.target import (
     TargetChanges,
 )
 from lifecycle.programming.tc import parse_queue, parse_rate
-from tests.unit.programming.fakes import FakeTool, failed, printed
+from tests.unit.programming.fakes import FakeTool, Waited, failed
 from tests.unit.programming.samples import ledger_in, rule
 
 NO_TABLE = failed("Error: No such file or directory\nlist table inet flowqos_robot\n")
-QDISCS = [
-    {"dev": "eth0", "kind": "pfifo_fast", "root": True},
-    {"dev": "wlan0", "kind": "fq_codel", "root": True},
-    {"dev": "e1", "kind": "htb", "root": True},
-    {"dev": "lo", "kind": "pfifo_fast", "root": True},
-]
 
 
 @pytest.mark.parametrize(
@@ -55,7 +49,7 @@ QDISCS = [
 )
 def test_a_refusal_is_told_as_what_it_is(stderr: str, message: str) -> None:
     with pytest.raises(ProgrammingError) as caught:
-        demand(FakeTool(("nft", failed(stderr))), ["nft", "-f", "-"], doing="mark")
+        asyncio.run(demand(FakeTool(("nft", failed(stderr))), ["nft", "-f", "-"], doing="mark"))
 
     assert str(caught.value) == message
 
@@ -64,7 +58,7 @@ def test_a_program_that_is_not_installed_is_told_with_its_package(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with pytest.raises(ProgrammingError) as caught:
-        HostTool(("nft-of-nowhere",)).run(["nft"])
+        asyncio.run(HostTool(("nft-of-nowhere",)).run(["nft"]))
 
     assert str(caught.value) == (
         "cannot run 'nft-of-nowhere': it is not installed; "
@@ -75,40 +69,15 @@ def test_a_program_that_is_not_installed_is_told_with_its_package(
 def test_programs_read_stdin_and_speak_english() -> None:
     code = "import os, sys; print(sys.stdin.read(), os.environ['LC_ALL'])"
 
-    assert HostTool().run([sys.executable, "-c", code], stdin="x").stdout == "x C\n"
+    done = asyncio.run(HostTool().run([sys.executable, "-c", code], stdin="x"))
 
-
-def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> None:
-    listed = printed(json.dumps(QDISCS))
-    tool = FakeTool(("nft -s list", NO_TABLE), ("tc -j qdisc show", listed))
-
-    changes = NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()])
-
-    remedy = "add one that looks at these flows: lifecycle flows apply MANIFEST --target tc"
-    bands = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
-    assert list(changes.warnings) == [
-        f"marking alone gives no priority on {device}: its queueing discipline {effect}; "
-        f"{remedy} --device {device} --rate RATE"
-        for device, effect in (
-            ("eth0", f"pfifo_fast {bands}"),
-            ("wlan0", "fq_codel does not look at DSCP"),
-        )
-    ]
-
-
-def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> None:
-    def missing() -> Output:
-        raise ProgrammingError("cannot run 'tc'")
-
-    tool = FakeTool(("nft -s list", NO_TABLE), ("tc", missing))
-
-    assert NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()]).warnings == ()
+    assert done.stdout == "x C\n"
 
 
 def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
     ledger = ledger_in(tmp_path)
-    tool = FakeTool(("nft -s list", NO_TABLE), ("nft -f", failed("Error: no memory")))
-    target = NftTarget(None, Means(ledger), tool)
+    tool = FakeTool(("nft list", NO_TABLE), ("nft -f", failed("Error: no memory")))
+    target = Waited(NftTarget(None, Means(ledger), tool))
 
     with pytest.raises(ProgrammingError, match="no memory"):
         target.apply([rule()])
@@ -163,7 +132,6 @@ def test_changes_read_as_a_list_with_their_counts() -> None:
             FlowChange(kind=ChangeKind.KEEP, key="/d", what="udp z"),
         ),
         left_out=("/e: why",),
-        warnings=("look out",),
     )
 
     assert changes.render() == (
@@ -172,8 +140,7 @@ def test_changes_read_as_a_list_with_their_counts() -> None:
         "  ~ /b: udp y (moved)\n"
         "  - /c\n"
         "  = /d: udp z\n"
-        "  left out: /e: why\n"
-        "  warning: look out"
+        "  left out: /e: why"
     )
     assert changes.render(done=True).startswith(
         "tc on eth0: 1 created, 1 updated, 1 deleted, 1 unchanged\n"

@@ -1,4 +1,4 @@
-"""Other supervisors and attached nodes: lost, found, shut down, and what they planned."""
+"""Other supervisors: lost, found, shut down, and what they planned."""
 
 from __future__ import annotations
 

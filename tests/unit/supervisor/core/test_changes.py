@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
-from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode, in_mode
+from lifecycle.plan.model import ExpectedParameter, Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core.orders import reaction_of
 from lifecycle.supervisor.run.events import (
@@ -323,10 +323,7 @@ def test_modes_may_change_and_the_nodes_follow() -> None:
 def test_parameters_of_the_mode_that_the_system_is_in_are_set() -> None:
     def plan(night: float) -> Plan:
         rates = {"day": 1.0, "night": night}
-        given = tuple(
-            ModeParameters(mode=mode, parameters=rate(CAMERA, value).expected_parameters)
-            for mode, value in rates.items()
-        )
+        given = {mode: rate(CAMERA, value).expected_parameters for mode, value in rates.items()}
         camera = replace(rate(CAMERA, 1.0), mode_parameters=given)
         modes = tuple(Mode(name=each, at=HERE) for each in rates)
         open_ = Policy(undeclared_nodes=EndpointPolicy.OPEN) if night > 2.0 else Policy()
@@ -600,11 +597,11 @@ def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_ag
 
 @pytest.mark.parametrize("ordered", [True, False])
 def test_a_mode_that_a_node_refuses_is_left_again_with_the_node_s_reason(ordered: bool) -> None:
-    given = ModeParameters(mode="blind", parameters=rate(CAMERA, 2.0).expected_parameters)
+    given = {"blind": rate(CAMERA, 2.0).expected_parameters}
     what = Reaction(rule="graph", what=Consequence.MODE, mode="blind")
     plan = modes("normal", "blind")
     base, camera = plan.nodes
-    camera = replace(camera, mode_parameters=(given,))
+    camera = replace(camera, mode_parameters=given)
     plan = replace(plan, nodes=(base, camera), on_violation=(what,))
     play = Play(plan, ways={"give camera": "read-only"})
     reason = "cannot enter mode 'blind': read-only"
