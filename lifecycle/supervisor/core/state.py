@@ -254,6 +254,7 @@ class Process(msgspec.Struct, kw_only=True):
         restarts: how often it was started again after a failure.
         starts: when it was started, by all that its start limit counts.
         in_a_row: its failures without a long run between them.
+        failure: its last one.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
         escalation: what is left of the steps to end it; None before it is asked to end.
@@ -273,7 +274,7 @@ class Process(msgspec.Struct, kw_only=True):
     restarts: int = 0
     starts: list[float] = []
     in_a_row: int = 0
-    failures: list[Failed] = []
+    failure: Failed | None = None
     failed: bool = False
     away_s: float | None = None
     escalation: Escalation | None = None
