@@ -293,12 +293,6 @@ class ConnectionAuthority:
         self._system.touch()
 
 
-def _may_be_wired(node: NodeRun) -> bool:
-    """Whether a node can be asked; one that was found active is verified as it was found."""
-    asked = node.driver is not None and not (node.is_gone or node.core.stuck)
-    return asked and node.core.base is not Level.ACTIVE
-
-
 def _done(step: Command, *, attempt: int = 1, error: str = "") -> WiringChanged:
     return WiringChanged(
         node=step.node,
