@@ -163,12 +163,6 @@ class BusySign:
         return now - max(since, before.at_ns) - (turns.waited_ns - before.waited_ns)
 
     @property
-    def busy_s(self) -> float:
-        """Seconds that the holder has been busy; 0 if it is not."""
-        since = self._words[_SINCE]
-        return max(0.0, (time.monotonic_ns() - since) / _NS) if since else 0.0
-
-    @property
     def what(self) -> str:
         """What the holder does, as it calls it; empty where it does not say."""
         text = bytes(self._memory[_WHAT : _WHAT + _WHAT_BYTES])

@@ -463,8 +463,7 @@ class Supervisor:
     def _end(self, ending: core.Ending) -> None:
         if self._last is not None:
             return
-        latest = self.system.run.judged.verdict
-        self._last = NOT_JUDGED if latest is None else self.system.liveliness.by_now(latest)
+        self._last = self.system.run.judged.verdict or NOT_JUDGED
         how = FAILED if ending.failed else ""
         self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
