@@ -339,7 +339,7 @@ def lifecycle_node(
                 raise error.with_traceback(None) from None
             plan = build_plan(loaded.manifest, domain_id=lifecycle_domain)
             planned = find_node(plan, node)
-            for name, value in (("ROS_LOG_DIR", str(tmp_path)), *planned.run.environment):
+            for name, value in (("ROS_LOG_DIR", str(tmp_path)), *planned.run.environment.items()):
                 monkeypatch.setenv(name, value)
             if planned.run.working_directory:
                 monkeypatch.chdir(planned.run.working_directory)

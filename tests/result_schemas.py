@@ -28,6 +28,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import Verdict
 
 FOLDER = Path(__file__).parents[1] / "schemas"
@@ -110,6 +111,7 @@ RESULTS = {
                 *("timeouts", "log_level"),
             ),
         },
+        edit=lambda schema: schema["$defs"]["Run"]["properties"].pop("attach"),  # it is a kind
     ),
     "status": Result(
         type_=SystemStatus,
@@ -145,7 +147,26 @@ def generate(name: str) -> str:
         "$defs": dict(sorted(defs.items())),
     }
     result.edit(schema)
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    return _text(schema)
+
+
+def _text(schema: _Schema) -> str:
+    """Return the text of a schema, with the rules of `lifecycle.verify` where they are meant."""
+    ids = [each.id for each in RULES]
+    families = dict.fromkeys(each.partition(".")[0] for each in ids)
+    lists = {"rules": ids, "rules and families": ["default", *families, *ids]}
+
+    def listed(part: Any) -> Any:
+        if isinstance(part, list):
+            return [*map(listed, part)]
+        if not isinstance(part, dict):
+            return part
+        found = {key: listed(each) for key, each in part.items()}
+        if isinstance(enum := part.get("enum"), str):
+            found["enum"] = lists[enum]
+        return found
+
+    return json.dumps(listed(schema), indent=2, ensure_ascii=False) + "\n"
 
 
 def _types(hint: Any) -> Iterator[type]:
@@ -219,7 +240,7 @@ def generate_manifest() -> str:
     for name, type_ in found.items():
         if name not in words:
             defs[name] = _section(type_, defs[name])
-    reaction = {"enum": list(get_args(written.Reaction))}
+    reaction = {"enum": list(get_args(written.Word))}
     for_rules["not"] = {"required": ["mode"]}
     names = [name for each in code_points() for name in (each.name, *each.aliases)]
     special = {
@@ -242,7 +263,7 @@ def generate_manifest() -> str:
         "title": "Manifest of a ROS 2 system, version 1",
         "$defs": {**dict(sorted(whole.items())), "substitution": _A_SUBSTITUTION},
     }
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    return _text(schema)
 
 
 def _is_enum(type_: type) -> bool:
@@ -341,7 +362,7 @@ class _Opening:
                 schema[key] = self.value(schema[key])
         if "enum" in schema:
             words = self.order.get(frozenset(schema["enum"]), schema["enum"])
-            schema["enum"] = list(words)
+            schema["enum"] = words if isinstance(words, str) else list(words)
             if all(isinstance(each, str) for each in words):
                 schema = {"type": "string", **schema}
             if len(words) == 1 and not isinstance(words[0], str):

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from lifecycle.manifest.model import Manifest
     from lifecycle.plan.model import Plan
     from lifecycle.plan.programs import Resolution
-    from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen
+    from lifecycle.programming.target import Program
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -357,24 +356,18 @@ def target_plan(
 
 def read_networks(
     targets: Sequence[str], given: Mapping[str, Any], *, option: str
-) -> tuple[tuple[Chosen, ...], Treatment | None]:
-    """Return the networks that were chosen, and what flows get; nothing where nothing was given.
+) -> Program | None:
+    """Return the networks that were chosen; None where nothing was given.
 
     Raises:
         UsageError: they do not fit together.
     """
     if not targets and not any(given.values()):
-        return (), None
+        return None
     # What programs networks takes long to import.
-    from lifecycle.programming.programmer import read_treatment
-    from lifecycle.programming.target import read_targets
+    from lifecycle.programming.programmer import read_program
 
-    given = dict(given)
-    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
-    chosen = read_targets(targets, given, option=option)
-    if not chosen:
-        raise UsageError(f"cannot use --dscp-from-5qi or --flow-labels without {option}")
-    return chosen, read_treatment(mapping, label_flows=flow_labels)
+    return read_program(targets, given, option=option)
 
 
 def network_options(*names: str, help_: str, multiple: bool = False) -> Callable[[F], F]:

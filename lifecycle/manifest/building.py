@@ -33,7 +33,6 @@ from lifecycle.manifest.model import (
     After,
     Condition,
     ConnectionDeclaration,
-    Consequence,
     EndpointKind,
     Executor,
     FlowNeed,
@@ -43,16 +42,15 @@ from lifecycle.manifest.model import (
     Mode,
     ModeParameter,
     Node,
-    OnViolation,
     ParameterValue,
     PublisherFlow,
     Quantity,
     Rate,
-    Reaction,
     Readiness,
     ReadyBy,
     Resources,
     Run,
+    RunKeys,
     RunKind,
     Supervision,
 )
@@ -245,21 +243,6 @@ def parameter_value(name: str, part: Document, found: Findings) -> ParameterValu
     return part.scalar
 
 
-def build_on_violation(section: Document) -> OnViolation:
-    """Build `on_violation` of a document or a node; a single value is for every rule."""
-    reactions = section.get("on_violation")
-    if reactions is None:
-        return ()
-    data = reactions.root.data
-    by_rule = isinstance(data, dict) and [*data] != ["mode"]
-    return tuple(
-        Reaction(rule=rule, what=Consequence.MODE, mode=each.text("mode"))
-        if isinstance(each.root.data, dict)
-        else Reaction(rule=rule, what=Consequence(each.scalar))
-        for rule, each in (reactions.entries() if by_rule else ((BY_DEFAULT, reactions),))
-    )
-
-
 _NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
 """Sections of which an entry is where its key is; of all others, a value is where it begins."""
 
@@ -347,13 +330,13 @@ def build_node(
         namespace=f"/{shared.within(node.namespace)}",
         machine=node.machine or shared.machine,
         process=shared.key(node.process) if node.process else "",
-        run=_run(part, base, shared, found),
+        run=_run(node.run, part, base, shared, found),
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
         remap=tuple(node.remap.items()),
         after=tuple(_after(part, shared, found)),
         supervision=build(Supervision, node),
-        on_violation=build_on_violation(part),
+        on_violation=node.on_violation.value if node.on_violation else (),
         interface=interface,
         flows=tuple(_flows(part)),
         connections=tuple(_connections(part, interface, found)),
@@ -395,11 +378,10 @@ def absolute(base: Path, path: str) -> str:
 _OF_PYTHON = ("arguments", "executor", "threads")
 
 
-def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
+def _run(run: RunKeys | None, node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     part = node.get("run")
-    if part is None:
+    if run is None or part is None:
         return Run(kind=RunKind.ATTACH)
-    run = read_part(part, written.Run)
     kind = RunKind.ATTACH if run.component or run.attach else RunKind.COMMAND
     meaningless: list[tuple[str, tuple[str, ...], str]] = []
     if run.python:
@@ -432,16 +414,17 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
             )
             hint = "set it lower, or leave it out"
             found.append(error("manifest.resources", at_high, message, hint))
-    container = run.container or ""
+    container = run.container
     return build(
         Run,
         run,
         kind=kind,
+        attach=None,  # it is a kind
         command=tuple(each.root.text for each in part.items("command")),
         arguments=_values(part, "arguments", found),
         extra_arguments=_values(part, "extra_arguments", found),
-        environment=tuple((name, each.root.text) for name, each in part.entries("environment")),
-        working_directory=absolute(base, run.working_directory) if run.working_directory else "",
+        environment={name: each.root.text for name, each in part.entries("environment")},
+        working_directory=run.working_directory and absolute(base, run.working_directory),
         prefix=tuple(each.root.text for each in part.items("prefix")),
         resources=resources and build(Resources, resources, at=part.key_at(("resources",))),
         # A full name, or the key of a node of the system.
@@ -449,9 +432,9 @@ def _run(node: Document, base: Path, shared: Shared, found: Findings) -> Run:
     )
 
 
-def _values(run: Document, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
-    values = ((name, parameter_value(name, each, found)) for name, each in run.entries(key))
-    return tuple((name, value) for name, value in values if value is not None)
+def _values(run: Document, key: str, found: Findings) -> dict[str, ParameterValue]:
+    values = {name: parameter_value(name, each, found) for name, each in run.entries(key)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def build_modes(root: Document, found: Findings) -> tuple[Mode, ...]:
@@ -481,7 +464,6 @@ def _flows(node: Document) -> Iterator[FlowNeed]:
                 flow,
                 kind=kind,
                 name=name,
-                dscp=None if flow.dscp is None else flow.dscp.value,
                 five_qi=None if five_qi == "auto" else five_qi,
                 five_qi_auto=five_qi == "auto",
                 rate_hz=rate.max or rate.min if isinstance(rate, Rate) else rate,

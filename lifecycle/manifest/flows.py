@@ -21,8 +21,8 @@ from lifecycle.manifest.model import (
     Node,
 )
 from lifecycle.manifest.names import topic_of
-from lifecycle.network.dscp import DIRECT, MappedPriority, map_priority
-from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
+from lifecycle.network.dscp import DIRECT, ECN_MASK, map_priority
+from lifecycle.network.five_qi import Needs, check_class, five_qi_of, propose
 from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
     Medium,
@@ -32,7 +32,6 @@ from lifecycle.network.medium import (
 )
 
 _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
-_ANY_LOSS = 1.0
 
 
 class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,63 +41,45 @@ class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
         five_qi: 1–254; None if not asked for, or if none fits.
         reason: why it is this one, or none, for `auto`; else empty.
         problem: message and hint of why it cannot be; two empty texts if it can.
-        issues: what is declared and the class does not keep.
+        issues: what is declared and the class does not keep, see `check_class`.
     """
 
     five_qi: int | None = None
     reason: str = ""
     problem: tuple[str, str] = ("", "")
-    issues: tuple[ClassIssue, ...] = ()
+    issues: tuple[tuple[str, str], ...] = ()
 
 
 def class_of(need: FlowNeed, *, max_delay_ms: float | None) -> FlowClass:
     """Return the class of one publisher's flow; the delay is declared, or that of its links."""
-    message_bytes = need.max_message_size
-    rate_bps = (
-        need.rate_hz * message_bytes * 8
-        if need.rate_hz is not None and message_bytes is not None
-        else None
+    size = need.max_message_size
+    rate_bps = None if need.rate_hz is None or size is None else need.rate_hz * size * 8
+    needs = Needs(
+        max_delay_ms=max_delay_ms, loss=need.loss, rate_bps=rate_bps, max_message_size=size
     )
     if need.five_qi_auto:
-        return _proposed(need, max_delay_ms, message_bytes, rate_bps)
-    if need.five_qi is None:
-        return FlowClass()
+        if max_delay_ms is None:
+            message = f"cannot propose a 5QI for {need.name!r}: no max_delay_ms is declared"
+            hint = "add 'max_delay_ms', or a link of its topic that has one"
+            return FlowClass(reason=message, problem=(message, hint))
+        # A guaranteed rate must be bought as a number; where none is declared, only if nothing else
+        # is fast enough.
+        found, why = propose(needs, need.rate_hz is not None)
+        if found is None and need.rate_hz is None:
+            found, why = propose(needs, None)
+        hint = "relax 'max_delay_ms', 'loss', 'rate_hz' or 'max_message_size'"
+        if found is None:
+            return FlowClass(reason=why, problem=(why, hint))
+        return FlowClass(five_qi=found.value, reason=why)
+    # What an operator's own class promises, only that operator knows.
+    if need.five_qi is None or need.five_qi in _OPERATOR_SPECIFIC:
+        return FlowClass(five_qi=need.five_qi)
     try:
         class_ = five_qi_of(need.five_qi)
     except ValueError as error:
-        if need.five_qi in _OPERATOR_SPECIFIC:
-            # An operator's own class: what it promises, only that operator knows.
-            return FlowClass(five_qi=need.five_qi)
         message, _, hint = str(error).partition("; ")
         return FlowClass(five_qi=need.five_qi, problem=(message, hint))
-    issues = check_class(
-        class_,
-        max_delay_ms=max_delay_ms,
-        loss=need.loss,
-        rate_bps=rate_bps,
-        message_bytes=message_bytes,
-    )
-    return FlowClass(five_qi=need.five_qi, issues=issues)
-
-
-def _proposed(
-    need: FlowNeed, max_delay_ms: float | None, message_bytes: int | None, rate_bps: float | None
-) -> FlowClass:
-    if max_delay_ms is None:
-        message = f"cannot propose a 5QI for {need.name!r}: no max_delay_ms is declared"
-        hint = "add 'max_delay_ms', or a link of its topic that has one"
-        return FlowClass(reason=message, problem=(message, hint))
-    loss = _ANY_LOSS if need.loss is None else need.loss
-    # A guaranteed rate must be bought as a number; where none is declared, only if nothing else is
-    # fast enough.
-    for gbr in (False, None) if need.rate_hz is None else (True,):
-        proposal = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes, rate_bps=rate_bps)
-        if proposal.five_qi is not None:
-            break
-    if proposal.five_qi is None:
-        hint = "relax 'max_delay_ms', 'loss', 'rate_hz' or 'max_message_size'"
-        return FlowClass(reason=proposal.why, problem=(proposal.why, hint))
-    return FlowClass(five_qi=proposal.five_qi.value, reason=proposal.why)
+    return FlowClass(five_qi=need.five_qi, issues=tuple(check_class(class_, needs)))
 
 
 class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
@@ -109,7 +90,7 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         topic: fully qualified name; empty if it cannot be resolved.
         unique: it must get an NFE of its own.
         flow_class: 5QI; publishers only.
-        priority: what becomes of its 'transport_priority'; None without.
+        tos: what becomes of its 'transport_priority', 0–255; None without, and if nothing is set.
         max_delay_ms: declared, else the shortest of the links from this node on the topic.
         max_datagram_bytes: what its participant must not exceed so that IP does not fragment it;
             None if that cannot happen or is not known.
@@ -120,7 +101,7 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     topic: str
     unique: bool
     flow_class: FlowClass
-    priority: MappedPriority | None = None
+    tos: int | None = None
     max_delay_ms: float | None = None
     max_datagram_bytes: int | None = None
     transports: tuple[Medium, ...] = ()
@@ -128,9 +109,9 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def dscp(self) -> int | None:
         """The DSCP of its data, of a subscription of what it acknowledges with, 0–63."""
-        if self.need.dscp is not None or self.priority is None:
-            return self.need.dscp
-        return self.priority.dscp
+        if self.need.dscp is not None:
+            return int(self.need.dscp)
+        return None if self.tos is None or self.tos & ECN_MASK else self.tos >> 2
 
     @property
     def five_qi(self) -> int | None:
@@ -138,29 +119,14 @@ class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
         return self.flow_class.five_qi
 
     @property
+    def non_blocking_send(self) -> bool:
+        """What finds the socket's buffer full is lost."""
+        return self.need.non_blocking_send
+
+    @property
     def prioritised(self) -> bool:
         """Whether a network is to treat this flow differently from others."""
         return self.unique or self.dscp is not None or self.five_qi is not None
-
-
-class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
-    """Endpoints of one kind and node that share an extra participant.
-
-    Attributes:
-        kind: PUBLISHER, or SUBSCRIPTION: then what they acknowledge with carries the DSCP.
-        names: declared, in the interface's order.
-        unique: it carries one publisher that needs an NFE of its own.
-        five_qi: the class by which a network distinguishes it; None if it need not.
-    """
-
-    kind: EndpointKind
-    names: tuple[str, ...]
-    unique: bool
-    dscp: int | None
-    five_qi: int | None
-    transports: tuple[Medium, ...]
-    max_datagram_bytes: int | None
-    non_blocking_send: bool
 
 
 class FlowNeeds:
@@ -190,60 +156,13 @@ class FlowNeeds:
         for need in node.flows:
             yield self._resolved[node.key, need.kind, need.name]
 
-    def node_transports(self, node: Node) -> tuple[Medium, ...]:
-        """Return all that a node's own participant may use, and its subscriptions receive by.
-
-        Empty for any.
-        """
-        for each in self.of_node(node):
-            if each.need.kind is not EndpointKind.SUBSCRIPTION or each.dscp is not None:
-                continue  # a marked one receives on a participant beside it
-            if each.transports:
-                return each.transports
-        return ()
-
-    def groups(self, node: Node) -> tuple[ParticipantGroup, ...]:
-        """Return the extra participants that a node's endpoints need: as few as meet every need.
-
-        A publisher that needs an NFE of its own shares with none. Others share if they ask for the
-        same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
-        acknowledgements leave by the sockets of the participant; they never share with publishers,
-        whose flow a network that looks at marks must not take theirs for. Within one node only: a
-        participant belongs to a node, whose hidden node is what the graph shows.
-        """
-        found: dict[object, ParticipantGroup] = {}
-        own = (None, None, self.node_transports(node), False)
-        for endpoint in node.interface.endpoints:
-            each = self.of(node.key, endpoint.kind, endpoint.name)
-            if each is None or not endpoint.kind.is_topic:
-                continue
-            unique = each.unique and endpoint.kind is EndpointKind.PUBLISHER
-            five_qi, transports = None if each.unique else each.five_qi, each.transports or own[2]
-            class_ = (each.dscp, five_qi, transports, each.need.non_blocking_send)
-            if not unique and class_ == own and each.max_datagram_bytes is None:
-                continue
-            key = endpoint.name if unique else (endpoint.kind, class_)
-            known = found.get(key)
-            sizes = (each.max_datagram_bytes, known.max_datagram_bytes if known else None)
-            found[key] = ParticipantGroup(
-                kind=endpoint.kind,
-                names=(*(known.names if known else ()), endpoint.name),
-                unique=unique,
-                dscp=each.dscp,
-                five_qi=five_qi,
-                transports=transports,
-                max_datagram_bytes=min((size for size in sizes if size is not None), default=None),
-                non_blocking_send=each.need.non_blocking_send,
-            )
-        return tuple(found.values())
-
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
         topic = topic_of(node, need.name, need.kind)
         network, discovery = self._manifest.network, self._manifest.discovery
-        priority = None
+        tos = None
         if need.transport_priority is not None:
             mapping = network.transport_priority_mapping or DIRECT
-            priority = map_priority(need.transport_priority, mapping)
+            tos = map_priority(need.transport_priority, mapping)
         delay = need.max_delay_ms
         if delay is None and need.kind is EndpointKind.PUBLISHER:
             delay = self._delays.get((node.key, topic))
@@ -259,7 +178,7 @@ class FlowNeeds:
             topic=topic,
             unique=need.unique.asks,
             flow_class=class_of(need, max_delay_ms=delay),
-            priority=priority,
+            tos=tos,
             max_delay_ms=delay,
             transports=(udp_to(address),) if by_participant else (),
         )

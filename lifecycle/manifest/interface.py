@@ -2,9 +2,10 @@
 
 Owns: what a QoS profile is with presets and defaults, declared defaults of parameters in their
 types; references (`local://relative/path`, `nodl://package/name`) with the documents they include,
-and what of NoDL differs from an inline interface: types without their kind, policies that must be
-written, types of generate_parameter_library. The format is nodl.schema.yaml of ros-tooling/nodl 2.0
-and parameter.schema.yaml. What is not used of it is a warning; what breaks it is an error.
+and what of NoDL differs from an inline interface: types without their kind, and those of
+generate_parameter_library, of which sizes and validations are not checked. The format is
+nodl.schema.yaml of ros-tooling/nodl 2.0 and parameter.schema.yaml. What it does not know is a
+warning; what cannot be an interface is an error.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from msgspec.structs import replace
 
 from lifecycle.codec import Octet
 from lifecycle.errors import did_you_mean, nearest
-from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import (
     Findings,
     ManifestError,
@@ -34,6 +34,7 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     Interface,
+    Parameter,
     ParameterDeclaration,
     ParameterValue,
 )
@@ -139,7 +140,7 @@ _TYPES: Mapping[str, Any] = {
 
 
 def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclaration:
-    declared = read_part(part, written.Parameter)
+    declared = read_part(part, Parameter)
     default: ParameterValue | None = None
     if (value := part.get("default_value")) is not None:
         try:
@@ -187,11 +188,10 @@ def read_interface(
     """
     reading = _NodlReading(search_prefixes(environment), found)
     try:
-        reading.follow(reference, Path(base), at, ())
+        reading.follow(reference, Path(base), at)
     except OSError as problem:  # a name that is too long, a folder that is not ours to search
         message = f"cannot follow {quote(reference)}: {problem.strerror}"
         found.append(error("nodl.not-found", at, message))
-    reading.report_collisions()
     return Interface(
         endpoints=tuple(reading.endpoints),
         parameters=tuple(reading.parameters),
@@ -210,18 +210,10 @@ class _NodlReading:
         self.parameters: list[ParameterDeclaration] = []
         self.found = found
 
-    def follow(self, reference: str, base: Path, at: Position, chain: tuple[Path, ...]) -> None:
-        """Read one reference; `chain` holds the documents that led to it."""
+    def follow(self, reference: str, base: Path, at: Position) -> None:
+        """Read one reference with what it includes; each document counts once."""
         path = self._locate(reference, base, at)
-        if path is None:
-            return
-        identity = path.resolve()
-        if identity in chain:
-            names = " → ".join(each.name for each in (*chain[chain.index(identity) :], identity))
-            self._error("cycle", at, f"cannot include {reference!r} in itself: {names}")
-            return
-        if identity in self._read:
-            self._error("twice", at, f"cannot include {reference!r} twice", "remove one include")
+        if path is None or (identity := path.resolve()) in self._read:
             return
         if len(self._read) == MAX_DOCUMENTS:
             self._error("limit", at, f"cannot include more than {MAX_DOCUMENTS} documents")
@@ -241,7 +233,7 @@ class _NodlReading:
             return
         for each in document.items("include"):
             if ref := each.text("ref"):
-                self.follow(ref, path.parent, each.at(("ref",)), (*chain, identity))
+                self.follow(ref, path.parent, each.at(("ref",)))
             else:
                 where = each.at(("ref",))
                 self._error("invalid", where, "cannot do without the key 'ref' in an include")
@@ -287,21 +279,8 @@ class _NodlReading:
         if (type_ := entries.get("type")) and type_.text.count("/") == 1:
             word = "msg" if kind.is_topic else "action" if kind.is_action else "srv"
             entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
-        if kind.is_topic and "qos" not in entries:
-            self._error("invalid", part.at(), f"cannot do without the key 'qos' in a {kind.noun}")
-        qos = part.get("qos") if "qos" in entries else None
-        if qos is not None and isinstance(qos.root.data, dict):
+        if (qos := part.get("qos")) and isinstance(qos.root.data, dict) and "qos" in entries:
             entries["qos"] = replace(qos.root, data=self._known(qos, POLICIES))
-            for name in ("history", "reliability"):
-                if name not in qos:
-                    message = f"cannot do without the key {name!r} in a QoS profile"
-                    self._error("invalid", qos.at(), message)
-            if qos.text("history") == "KEEP_LAST" and "depth" not in qos:
-                message = "cannot do without 'depth' under KEEP_LAST"
-                self._error("invalid", qos.at(), message, "add 'depth: 10'")
-        elif qos is not None:
-            message = f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping"
-            self._error("invalid", qos.at(), message)
         return replace(part.root, data=entries)
 
     def _parameter(self, name: str, part: Document) -> Value | None:
@@ -310,17 +289,12 @@ class _NodlReading:
             return part.root
         entries = self._known(part, (*_PARAMETER_KEYS, *_UNCHECKED))
         type_ = entries.get("type")
+        if "__map_" in name or (type_ and type_.text == "none"):
+            return None
         if type_ and (fixed := _FIXED_SIZE.fullmatch(type_.text)):
-            self._unchecked(part.at(("type",)), f"the size in type {type_.text!r}")
             entries["type"] = _text(type_, fixed[1])
         for key in _UNCHECKED:
-            if (unchecked := entries.pop(key, None)) and unchecked.data is not None:
-                self._unchecked(part.at((key,)), f"{key!r}")
-        if name.startswith("__map_") or ".__map_" in name:
-            self._unchecked(part.at(), f"the parameter map {name!r}")
-            return None
-        if type_ and type_.text == "none":
-            return None
+            entries.pop(key, None)
         return replace(part.root, data=entries)
 
     def _known(self, part: Document, words: Iterable[str]) -> dict[str, Value]:
@@ -334,22 +308,6 @@ class _NodlReading:
             hint = did_you_mean(key, known)
             self.found.append(warning("nodl.unknown-key", each.key_at(), message, hint))
         return found
-
-    def _unchecked(self, at: Position, what: str) -> None:
-        message = f"cannot check {what}; parameters are checked by type only"
-        self.found.append(warning("nodl.unchecked", at, message))
-
-    def report_collisions(self) -> None:
-        """Refuse a name that two entries of one list declare (nodl.schema.yaml, `include`)."""
-        first: dict[tuple[str, str], Position] = {}
-        entries = [(each.kind.noun, each.name, each.at) for each in self.endpoints]
-        entries += [("parameter", each.name, each.at) for each in self.parameters]
-        for what, name, at in entries:
-            other = first.setdefault((what, name), at)
-            if other is not at:
-                where = other.spelled
-                message = f"cannot declare {what} {name!r} twice; the first is at {where}"
-                self._error("duplicate", at, message, "remove one")
 
     def _locate(self, reference: str, base: Path, at: Position) -> Path | None:
         scheme, _, body = reference.partition("://")

@@ -22,7 +22,6 @@ from lifecycle.manifest.building import (
     Shared,
     build_modes,
     build_node,
-    build_on_violation,
     positions_of,
     quantities,
     settle,
@@ -54,7 +53,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
-from lifecycle.manifest.written import build, read_part
+from lifecycle.manifest.written import OnViolation, build, read_part
 from lifecycle.manifest.yaml.arguments import substitute
 from lifecycle.manifest.yaml.document import Document, Place, Value, quote
 from lifecycle.manifest.yaml.source import read_document
@@ -196,10 +195,6 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     return replace(manifest, nodes=tuple(nodes), links=tuple(links), modes=tuple(modes))
 
 
-SUFFIX = ".lifecycle.yaml"
-"""What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
-
-
 _SECTIONS = ("discovery", "network", "data_layer", "on_violation")
 """Sections of a document that findings may be about."""
 
@@ -279,12 +274,6 @@ class _Loading:
             message = f"cannot use {what} as a manifest"
             self.found.append(error("manifest.kind", document.at(), message, hint))
             return
-        if not document.file.endswith(SUFFIX):
-            at = Position(file=document.file, line=1, column=1)
-            name = Path(document.file).name
-            message = f"cannot tell by its name {name!r} that this is a manifest"
-            stem = name.removesuffix(".yaml").removesuffix(".yml")
-            self.found.append(note("manifest.suffix", at, message, f"rename it to {stem}{SUFFIX}"))
         before = len(self.found)
         surroundings = Surroundings(
             environment=self._environment, folder=folder_of(path), programs=self._programs
@@ -312,6 +301,7 @@ class _Loading:
 
     def _system(self, document: Document, arguments: tuple[tuple[str, str], ...]) -> None:
         """Build what is declared of the whole system: the outermost manifest's holds."""
+        reactions = document.get("on_violation")
         declared = Manifest(
             path=document.file,
             arguments=arguments,
@@ -321,7 +311,7 @@ class _Loading:
             network=read_part(document, Network, ("network",)),
             data_layer=read_part(document, DataLayer, ("data_layer",)),
             policy=read_part(document, Policy, ("policy",)),
-            on_violation=build_on_violation(document),
+            on_violation=read_part(reactions, OnViolation).value if reactions else (),
             modes=build_modes(document, self.found),
             positions={
                 **positions_of(document, _SECTIONS),
@@ -462,23 +452,13 @@ MAX_MANIFESTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-def _identity(path: Path) -> str:
-    """Return a path without links, to recognise a file again."""
-    try:
-        return os.path.realpath(path)
-    except (OSError, ValueError):  # a name that no file can have; opening it reports that
-        return str(path)
-
-
 def _locate(entry: Document, chain: tuple[Path, ...], found: Findings) -> Path | None:
     """Return the file that an entry of `include:` names; None after reporting why there is none."""
     name = entry.text("manifest")
     path = Path(os.path.normpath(chain[-1].parent / name))
-    identities = [_identity(each) for each in chain]
     why, hint = "", ""
-    if (identity := _identity(path)) in identities:
-        round_trip = [*chain[identities.index(identity) :], path]
-        why = f"it would include itself, {' → '.join(each.name for each in round_trip)}"
+    if path in map(Path, map(os.path.normpath, chain)):
+        why = "it would include itself"
     elif len(chain) == MAX_INCLUDE_DEPTH:
         why = f"at most {MAX_INCLUDE_DEPTH} manifests in a row"
     elif not os.path.exists(path):

@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-import json
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,6 +17,7 @@ import msgspec
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, error
+from lifecycle.manifest.written import MANIFEST, read_schema
 from lifecycle.manifest.yaml.document import (
     YAML_1_1_BOOLEANS,
     Document,
@@ -35,20 +33,7 @@ ValidationError = Any
 _CHOICES = ("anyOf", "oneOf")
 
 
-MANIFEST = "manifest.v1.schema.json"
-"""The file, in schemas/, that defines what a manifest may hold."""
-
 _SUBSTITUTION = {"$ref": "#/$defs/substitution"}
-
-
-@functools.cache
-def read_schema(name: str) -> Mapping[str, Any]:
-    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
-    # Wheels hold a copy of schemas/; a checkout holds a link to it.
-    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
-    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
-    schema: Mapping[str, Any] = json.loads(text)
-    return schema
 
 
 def validate(
@@ -192,88 +177,31 @@ def _unknown_keys(document: Document, each: ValidationError) -> Iterator[tuple[P
         if key in known:
             continue
         place, message = (*_place(each), key), f"cannot use the unknown key {quote(key)}"
-        where = _elsewhere(place)
-        meant = _written(place[:-1], key, known) or did_you_mean(key, known)
+        other = _OTHERS.get(key)
+        hint = f"write '{other}'" if other else did_you_mean(key, known)
         value = each.instance[key]
         if "nodes" in known and isinstance(value, dict) and "run" in value:
-            meant = "a node is indented below 'nodes:'"
-        if not meant and (not where or len(known) <= _FEW):
+            hint = "a node is indented below 'nodes:'"
+        if not hint:
             message = f"{message}; allowed: {', '.join(known)}"
-        hint = meant or where
         yield place, error("manifest.unknown-key", document.key_at(place), message, hint)
-
-
-def _written(place: Place, key: str, known: Collection[str]) -> str:
-    """Return how a manifest writes what others call `key`; empty if it has no other name."""
-    text = _OTHERS.get(key, "")
-    other = text.partition(":")[0]
-    where = "" if other in known else _elsewhere((*place, other))
-    return text and f"write '{text}'{where.replace('it is', ',')}"
 
 
 _OTHERS = {
     "latched": "durability: TRANSIENT_LOCAL",
     "queue_size": "depth",
-    "pkg": "package",
-    "exec": "executable",
-    "plugin": "component",
-    "args": "command",
-    "cwd": "working_directory",
-    "env": "environment",
+    "pkg": "run: {package: …}",
+    "exec": "run: {executable: …}",
+    "plugin": "run: {component: …}",
+    "args": "run: {command: …}",
+    "cwd": "run: {working_directory: …}",
+    "env": "run: {environment: …}",
     "remappings": "remap",
     "params": "parameters",
-    "respawn": "restart: always",
+    "respawn": "restart: always' beside 'run",
     "respawn_delay": "restart_sec",
 }
 """What launch files and client libraries say otherwise, and how a manifest writes it."""
-
-_FEW = 5
-"""So many keys are listed also where a better place for an unknown one is named."""
-
-_NAME = "NAME"
-"""In a place, any name that users choose, or any number in a list."""
-
-
-def _elsewhere(place: Place) -> str:
-    """Return which other mapping of a manifest has the last key of `place`; empty if none."""
-
-    def likeness(known: tuple[str, ...]) -> tuple[int, int, int]:
-        pairs = itertools.takewhile(
-            lambda two: two[1] in (two[0], _NAME), zip(place, known, strict=False)
-        )
-        return len([*pairs]), len({*place} & {*known}), -len(known)
-
-    found = [each for each in _places() if each[-1] == place[-1]]
-    if not found:
-        return ""
-    nearest_one = max(found, key=likeness)
-    same = likeness(nearest_one)[0]
-    return f"it is a key of {'.'.join(map(str, (*place[:same], *nearest_one[same:-1])))}"
-
-
-@functools.cache
-def _places() -> tuple[tuple[str, ...], ...]:
-    """Return the place of each key that a manifest may have."""
-    whole = read_schema(MANIFEST)
-
-    def walk(
-        schema: Mapping[str, Any], place: tuple[str, ...], within: tuple[str, ...]
-    ) -> Iterator[tuple[str, ...]]:
-        name = schema.get("$ref", "").rpartition("/")[2]
-        if name in within:
-            return
-        if name:
-            schema, within = whole["$defs"][name], (*within, name)
-        for key, each in schema.get("properties", {}).items():
-            yield (*place, key)
-            yield from walk(each, (*place, key), within)
-        for keyword in ("additionalProperties", "items"):
-            if isinstance(each := schema.get(keyword), dict):
-                yield from walk(each, (*place, _NAME), within)
-        for each in itertools.chain(*(schema.get(keyword, ()) for keyword in _CHOICES)):
-            yield from walk(each, place, within)
-
-    return tuple(dict.fromkeys(walk(whole, (), ())))
 
 
 def _missing_keys(document: Document, each: ValidationError) -> Iterator[tuple[Place, Diagnostic]]:
@@ -326,7 +254,7 @@ def _allowed(each: ValidationError) -> tuple[str, str]:
     if each.validator in {"enum", "const"}:
         allowed = [each.validator_value] if each.validator == "const" else each.validator_value
         spelled = ", ".join(x if isinstance(x, str) else quote(x) for x in allowed)
-        return f"allowed: {spelled}", _closest(each.instance, allowed) or _of_another_key(each)
+        return f"allowed: {spelled}", _closest(each.instance, allowed)
     if each.validator == "pattern":
         return "", _pattern(each)
     keywords = ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum")
@@ -381,13 +309,13 @@ def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
     elif types == ["string"] and isinstance(value, (bool, int, float)):
         hint = "put it in quotes"
     elif isinstance(value, str) and {"integer", "number"} & {*types}:
-        hint = _number(value, _name(each), each.schema)
+        hint = _number(value)
     elif types == ["object"] and value is None:
         hint = "indent below it what belongs to it"
     elif _name(each) == "qos" and type(value) is int:
         hint = f"write {{depth: {value}}}"
     elif types == ["object"]:
-        key = next(iter((*each.schema.get("required", ()), *_known(each), _NAME)))
+        key = next(iter((*each.schema.get("required", ()), *_known(each), "NAME")))
         joined += f", as in {{{key}: …}}"
     elif types == ["array"] and isinstance(value, str):
         hint = f"write [{', '.join(value.split())}]"
@@ -396,37 +324,13 @@ def _types(each: ValidationError, types: list[str]) -> tuple[str, str]:
     return f"it must be {joined}", hint
 
 
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+))\s*([A-Za-z%µ/]*)\s*")
-
-
-def _number(value: str, name: str, schema: Mapping[str, Any]) -> str:
-    """Return how to write a number that is in quotes, or has a unit; empty if it is none."""
-    found = _NUMBER.fullmatch(value)
-    if found is None:
+def _number(value: str) -> str:
+    """Return how to write a number that is in quotes; empty if it is none."""
+    try:
+        float(value)
+    except ValueError:
         return ""
-    number, unit = found.groups()
-    if unit == "%" and schema.get("maximum") == 1:
-        return f"write {float(number) / 100:g}"
-    if not unit:
-        return f"write {number}, without quotes"
-    wanted = name.rpartition("_")[2]
-    if unit.lower() == wanted:
-        return f"write {number}"
-    return f"write the number alone, in {wanted}" if wanted in _UNITS else ""
-
-
-_UNITS = ("s", "sec", "ms", "ns", "hz", "bytes", "mib", "percent")
-"""What the names of keys end with, where they hold a number with a unit."""
-
-
-def _of_another_key(each: ValidationError) -> str:
-    """Return which other policy of a QoS profile takes a value; empty if none does."""
-    policies = read_schema(MANIFEST)["$defs"]["Qos"]["properties"]
-    for other in policies if _name(each) in policies else ():
-        branches = policies[other].get("anyOf", ())
-        if any(each.instance in branch.get("enum", ()) for branch in branches):
-            return f"it is a value of '{other}'"
-    return ""
+    return f"write {value.strip()}, without quotes"
 
 
 def _closest(value: object, allowed: list[object]) -> str:

@@ -7,39 +7,69 @@ Owns: which keys there are, what their values may be, and what editors and messa
 
 from __future__ import annotations
 
+import functools
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
 
 from lifecycle.manifest.model import (
-    RULES_AND_FAMILIES,
+    BY_DEFAULT,
     WORD,
     Condition,
+    Consequence,
     DataLayer,
     Discovery,
     Dscp,
     EndpointPolicy,
-    Executor,
     Health,
     LinkKeys,
     Network,
     NodeKey,
+    Parameter,
+    ParameterValue,
     Policy,
-    ProcessKeys,
     PublisherFlow,
-    ResourceLimits,
+    Reaction,
+    RunKeys,
+    Scalar,
     Special,
     SubscriptionFlow,
     Supervision,
     TargetState,
     Text,
     Timeouts,
+    Ways,
     require,
     spelled,
 )
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
+
+MANIFEST = "manifest.v1.schema.json"
+"""The file, in schemas/, that defines what a manifest may hold."""
+
+
+@functools.cache
+def read_schema(name: str) -> Mapping[str, Any]:
+    """Return a shipped schema as it is in schemas/, for editors and for other programs."""
+    # Wheels hold a copy of schemas/; a checkout holds a link to it.
+    # Found as `importlib.resources` finds it, which takes longer to import than to read it.
+    text = (Path(__file__).parents[1] / "_schemas" / name).read_text(encoding="utf-8")
+    schema: Mapping[str, Any] = json.loads(text)
+    return schema
+
+
+def _rules() -> Collection[str]:
+    """Return what `on_violation` may name, which the schema lists: ids and families of rules."""
+    keys: Collection[str] = read_schema(MANIFEST)["$defs"]["OnViolation"]["anyOf"][1][
+        "propertyNames"
+    ]["enum"]
+    return keys
+
 
 T = TypeVar("T")
 B = TypeVar("B", bound=Struct)
@@ -55,35 +85,7 @@ Prefix = Annotated[
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
-PythonName = Annotated[
-    str,
-    spelled(
-        rf"^{WORD}(\.{WORD})*:{WORD}\Z",
-        "write module:Class, as in examples.teleop.nodes:Camera",
-    ),
-    Meta(examples=["examples.teleop.nodes:Camera"]),
-]
-Plugin = Annotated[
-    str,
-    spelled(
-        rf"^[A-Za-z][A-Za-z0-9_]*/{WORD}(::{WORD})*\Z",
-        "write package/Plugin, as in image_tools/image_tools::Cam2Image",
-    ),
-    Meta(examples=["image_tools/image_tools::Cam2Image"]),
-]
-Keyword = Annotated[
-    str, spelled(rf"^{WORD}\Z", "name an argument: letters, digits and '_', not a digit first")
-]
-Variable = Annotated[
-    str, spelled(rf"^{WORD}\Z", "name an environment variable: letters, digits and '_'")
-]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-
-Scalar = str | int | float | bool
-"""A value that is one word: where its text counts, whatever scalar it is."""
-
-Values = Scalar | tuple[Scalar, ...]
-"""The value of a ROS parameter or of an argument of a Python class."""
 
 Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
 """What `if:` and `unless:` may be once their substitutions are resolved."""
@@ -93,30 +95,29 @@ class ParameterTree(Special):
     """Value of a ROS parameter, or a mapping of further parameters."""
 
 
-TREE = Values | Annotated[dict[str, ParameterTree], Meta(min_length=1)]
+TREE = ParameterValue | Annotated[dict[str, ParameterTree], Meta(min_length=1)]
 """What a `ParameterTree` may be."""
 
-Ways = tuple[tuple[str, ...], ...]
-"""Sets of keys; a set is written if all of its keys are."""
+_NOT_WRITTEN = (None, "", ())
 
 
 def _written(section: object, ways: Ways) -> int:
     """Return how many of these sets of keys are written."""
-    return sum(all(getattr(section, key) is not None for key in way) for way in ways)
+    return sum(all(getattr(section, key) not in _NOT_WRITTEN for key in way) for way in ways)
 
 
 RuleOrFamily = Annotated[
     str,
     Meta(
         extra_json_schema={
-            "enum": [*RULES_AND_FAMILIES],
+            "enum": "rules and families",
             "patternErrorMessage": "use 'default', a family of rules as 'flow', or the id of a"
             " rule (docs/rules.md)",
         }
     ),
 ]
 
-Reaction = Literal["report", "deactivate", "pause", "stop"]
+Word = Literal["report", "deactivate", "pause", "stop"]
 
 
 class EnterMode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -138,7 +139,7 @@ class OnViolation(Special):
     """
 
 
-ForRules = Annotated[dict[RuleOrFamily, Reaction | EnterMode], Meta(min_length=1)]
+ForRules = Annotated[dict[RuleOrFamily, Word | EnterMode], Meta(min_length=1)]
 """What is done by rule or family."""
 
 
@@ -156,12 +157,17 @@ def read_special(type_: type, value: object) -> object:
             require(value in names)
             return Dscp(parse_dscp(value))
         return Dscp(parse_dscp(msgspec.convert(value, int, strict=isinstance(value, bool))))
-    if not isinstance(value, dict):
-        return OnViolation(msgspec.convert(value, Reaction))
-    if [*value] == ["mode"]:
-        return OnViolation(msgspec.convert(value, EnterMode))
-    require(value.keys() <= {*RULES_AND_FAMILIES})
-    return OnViolation(msgspec.convert(value, ForRules))
+    by_rule = isinstance(value, dict) and [*value] != ["mode"]
+    reactions = msgspec.convert(value if by_rule else {BY_DEFAULT: value}, ForRules)
+    require(reactions.keys() <= {*_rules()})
+    return OnViolation(
+        tuple(
+            Reaction(rule=rule, what=Consequence.MODE, mode=each.mode)
+            if isinstance(each, EnterMode)
+            else Reaction(rule=rule, what=Consequence(each))
+            for rule, each in reactions.items()
+        )
+    )
 
 
 def read(plain: object, type_: type[T], *, strict: bool = True) -> T:
@@ -230,65 +236,6 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     inactive: tuple[NodeKey, ...] = ()
     parameters: dict[NodeKey, dict[str, ParameterTree]] = field(default_factory=dict)
-
-
-class Run(ProcessKeys, frozen=True, kw_only=True):
-    """How the node comes to run; exactly one way.
-
-    Attributes:
-        python: Node class, module:Class, or a function that returns nodes, module:function.
-        arguments: Keyword arguments that the class or function of 'python' is called with.
-        executor: What runs the callbacks of the Python process; nodes that share it must agree.
-        threads: Threads of 'executor: multi'; one for each processor, at least two, if left out.
-        command: Program and its arguments; ROS arguments are appended as 'ros_args' says.
-        package: Installed package that holds 'executable'.
-        executable: Executable in lib/PACKAGE.
-        attach: Others start this node.
-        environment: Environment variables on top of the supervisor's.
-        working_directory: Folder the process starts in, relative to this manifest.
-        component: Plugin that a component container loads, package/Plugin.
-        container: Node that loads 'component': the key of a node here, or the full name of one that
-            others start.
-        extra_arguments: Extra arguments of the request that loads 'component' (LoadNode.srv), as
-            'use_intra_process_comms' of rclcpp_components.
-        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf.
-        resources: What the process and all that it starts may use together, as
-            systemd.resource-control(5); set by systemd where that runs, else unverifiable.
-    """
-
-    ONE_OF: ClassVar[Ways] = (
-        ("python",),
-        ("command",),
-        ("package", "executable"),
-        ("component", "container"),
-        ("attach",),
-    )
-
-    python: PythonName | None = None
-    arguments: dict[Keyword, Values] | None = None
-    executor: Executor = Executor.SINGLE
-    threads: Annotated[int, Meta(ge=1, le=256)] | None = None
-    command: Annotated[tuple[Scalar, ...], Meta(min_length=1)] | None = None
-    package: Text | None = None
-    executable: Text | None = None
-    attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
-    environment: dict[Variable, Scalar] | None = None
-    working_directory: Text | None = None
-    component: Plugin | None = None
-    container: Annotated[Text, Meta(examples=["container", "/robot/container"])] | None = None
-    extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
-    prefix: (
-        Annotated[
-            tuple[Scalar, ...],
-            Meta(min_length=1, examples=[["gdb", "-ex", "run", "--args"], ["nice", "-n", 5]]),
-        ]
-        | None
-    ) = None
-    resources: ResourceLimits | None = None
-
-    def __post_init__(self) -> None:
-        """Raise ValueError unless exactly one way to start is written."""
-        require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
 def _interface_type(kind: str, example: str) -> Meta:
@@ -402,35 +349,6 @@ class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Literal["SYSTEM_DEFAULT", "AUTOMATIC", "MANUAL_BY_TOPIC", "BEST_AVAILABLE"] | None
     ) = None
     liveliness_lease_duration_ns: Nanoseconds | None = None
-
-
-ParameterType = Literal[
-    "bool",
-    "int",
-    "double",
-    "string",
-    "bool_array",
-    "int_array",
-    "double_array",
-    "string_array",
-    "byte_array",
-]
-
-
-class Parameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One parameter declaration.
-
-    Attributes:
-        type: Type, as generate_parameter_library and rcl_interfaces name it.
-        default_value: Value when none is given.
-        description: What it means; for people.
-        read_only: It cannot change once the node runs.
-    """
-
-    type: ParameterType
-    default_value: Values | None = None
-    description: str = ""
-    read_only: bool = False
 
 
 class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -579,7 +497,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     if_: Truth | None = field(name="if", default=None)
     unless: Truth | None = None
-    run: Run | None = None
+    run: RunKeys | None = None
     attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
     machine: Text | None = None
     namespace: Annotated[str, Meta(examples=["/robot"])] = ""
@@ -602,8 +520,9 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     may_end: bool = False
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless exactly one way to start is written."""
-        require(self.attach is not False and _written(self, self.ONE_OF) == 1)
+        """Raise ValueError unless exactly one way to start is written, here and in `run`."""
+        for each in (self, self.run) if self.run else (self,):
+            require(each.attach is not False and _written(each, each.ONE_OF) == 1)
 
 
 NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
@@ -713,3 +632,9 @@ class Manifest(Shared, frozen=True, kw_only=True):
     on_violation: OnViolation | None = None
     modes: Annotated[dict[Name, Mode], Meta(min_length=1)] | None = None
     links: tuple[LinkKeys, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rule that there is not."""
+        super().__post_init__()
+        if self.policy.trust:
+            require({*self.policy.trust} <= {each for each in _rules() if "." in each})

@@ -1,7 +1,7 @@
 """DSCP (differentiated services code point): names, numbers, TOS byte, TRANSPORT_PRIORITY mapping.
 
-Owns: every spelling of a DSCP that a user may write or read; TRANSPORT_PRIORITY → TOS byte as RTI
-Connext Micro computes it (*Connext Micro, Transport Priority*), and what that silently loses. Pure.
+Owns: how users write and read a DSCP; TRANSPORT_PRIORITY → TOS byte as RTI Connext Micro computes
+it (*Connext Micro, Transport Priority*). Pure.
 
 A DSCP is the upper six bits of the byte that IPv4 calls TOS and IPv6 calls traffic class; the lower
 two are ECN (RFC 2474, RFC 3168). Products differ in which of the two numbers they ask for, so both
@@ -11,7 +11,6 @@ are always shown side by side.
 from __future__ import annotations
 
 import functools
-import re
 
 import msgspec
 
@@ -47,72 +46,28 @@ def _by_name() -> dict[str, CodePoint]:
     return {name: each for each in code_points() for name in (each.name, *each.aliases)}
 
 
-@functools.cache
-def _by_number() -> dict[int, CodePoint]:
-    return {each.dscp: each for each in code_points()}
-
-
 def parse_dscp(value: str | int) -> int:
-    """Return the DSCP, 0–63, that a user wrote as a name (any case) or as a number.
-
-    Numbers may be decimal or hexadecimal (`0x2e`) text.
+    """Return the DSCP, 0–63, of a name as in the table, or of a number.
 
     Raises:
-        ValueError: neither a name nor a number in range; names the nearest name, or which DSCP was
-            meant when the number is a TOS byte.
+        ValueError: neither a name nor a number in range.
     """
+    number = _by_name()[value].dscp if value in _by_name() else value
     # YAML reads `yes` and `on` as booleans, and bool is an int: True is not DSCP 1.
-    if isinstance(value, bool):
-        raise ValueError(  # noqa: TRY004 - callers report every refusal alike
-            f"cannot use {value!r} as DSCP; use 0 to {MAX_DSCP} or a name such as EF"
-        )
-    number = value if isinstance(value, int) else _number(value.strip())
-    if number is None:
-        return _named(str(value))
-    if 0 <= number <= MAX_DSCP:
-        return number
-    hint = ""
-    if 0 <= number <= 0xFF:  # a TOS byte, most probably
-        name = f" ({_by_number()[number >> 2].name})" if number >> 2 in _by_number() else ""
-        ecn = " and sets ECN bits" if number & ECN_MASK else ""
-        hint = f"; {number} is a TOS byte{ecn}: DSCP {number >> 2}{name}"
-    raise ValueError(f"cannot use DSCP {value}; use 0 to {MAX_DSCP} or a name such as EF{hint}")
-
-
-def _number(text: str) -> int | None:
-    """The decimal or hexadecimal number that `text` spells, else None."""
-    # int() reads more than we document ("1_0", other scripts' digits) and refuses 4301 digits.
-    if not re.fullmatch(r"-?(0[xX][0-9a-fA-F]{1,8}|[0-9]{1,9})", text):
-        return None
-    return int(text, 16 if "x" in text.lower() else 10)
-
-
-def _named(text: str) -> int:
-    name = text.strip().upper().replace("_", "-")
-    if (found := _by_name().get(name)) is not None:
-        return found.dscp
-    import difflib  # only a mistake needs it
-
-    close = difflib.get_close_matches(name, _by_name(), n=len(_by_name()))
-    # Many names are equally near (AF14: AF13, AF41); people mistype the last digit, not the first.
-    nearest = max(close, key=lambda each: each[:-1] == name[:-1], default="")
-    hint = f"; did you mean {nearest}?" if nearest else ""
-    names = ", ".join(each.name for each in code_points())
-    raise ValueError(f"cannot use {text!r} as DSCP; use 0 to {MAX_DSCP} or one of {names}{hint}")
+    if isinstance(number, bool) or number not in range(MAX_DSCP + 1):
+        names = ", ".join(each.name for each in code_points())
+        raise ValueError(f"cannot use {value!r} as DSCP; use 0 to {MAX_DSCP} or one of {names}")
+    return int(number)
 
 
 def dscp_name(dscp: int) -> str:
-    """Return the code point's name, or the number in decimal where it has none.
-
-    `parse_dscp` reads either back, and refuses what is not 0–63.
-    """
-    number = parse_dscp(dscp)
-    return _by_number()[number].name if number in _by_number() else str(number)
+    """Return the code point's name, or the number in decimal where it has none."""
+    return next((each.name for each in code_points() if each.dscp == dscp), str(dscp))
 
 
 def tos(dscp: int) -> int:
     """Return the TOS byte (IPv4) or traffic class (IPv6) that carries this DSCP, ECN clear."""
-    return parse_dscp(dscp) << 2
+    return dscp << 2
 
 
 def describe(dscp: int) -> str:
@@ -120,9 +75,6 @@ def describe(dscp: int) -> str:
     name = dscp_name(dscp)
     prefix = "" if name.isdecimal() else f"{name} = "
     return f"{prefix}DSCP {dscp} = TOS {tos(dscp)} (0x{tos(dscp):02x})"
-
-
-_BITS_32 = 0xFFFFFFFF
 
 
 class TransportPriorityMapping(
@@ -148,42 +100,17 @@ DIRECT = TransportPriorityMapping(mask=0xFF)
 """Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
 
 
-class MappedPriority(msgspec.Struct, frozen=True, kw_only=True):
-    """What becomes of one TRANSPORT_PRIORITY value.
-
-    Attributes:
-        tos: 0–255; None if the mask is 0 and the TOS byte is not set.
-        ignored_bits: bits of the priority that made no difference: outside the mask or shifted out.
-    """
-
-    tos: int | None
-    ignored_bits: int
-
-    @property
-    def dscp(self) -> int | None:
-        """0–63; None if nothing is set, or ECN bits would be."""
-        return None if self.tos is None or self.sets_ecn else self.tos >> 2
-
-    @property
-    def sets_ecn(self) -> bool:
-        """Whether the result would write the two ECN bits, which belong to the transport."""
-        return self.tos is not None and bool(self.tos & ECN_MASK)
-
-
-def map_priority(priority: int, mapping: TransportPriorityMapping) -> MappedPriority:
-    """Return the TOS byte for a TRANSPORT_PRIORITY value, in integer arithmetic.
+def map_priority(priority: int, mapping: TransportPriorityMapping) -> int | None:
+    """Return the TOS byte for a TRANSPORT_PRIORITY value; None if the mask is 0: none is set.
 
     Let n be the number of 4-bit right shifts until `mask & 0xffff0000` is 0. Then
-    `TOS = ((priority & mask) >> 4n) * (high - low) / (mask >> 4n) + low`.
+    `TOS = ((priority & mask) >> 4n) * (high - low) / (mask >> 4n) + low`, in integers.
     """
-    bits = priority & _BITS_32
-    if mapping.mask == 0:
-        return MappedPriority(tos=None, ignored_bits=bits)
     shift = 0
     while (mapping.mask >> shift) & 0xFFFF0000:
         shift += 4
-    masked, mask = (bits & mapping.mask) >> shift, mapping.mask >> shift
-    return MappedPriority(
-        tos=masked * (mapping.high - mapping.low) // mask + mapping.low,
-        ignored_bits=bits & ~(masked << shift),
-    )
+    mask = mapping.mask >> shift
+    if not mask:
+        return None
+    masked = (priority & mapping.mask) >> shift
+    return masked * (mapping.high - mapping.low) // mask + mapping.low

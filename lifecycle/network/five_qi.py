@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import enum
 import functools
+from collections.abc import Iterator
 
 import msgspec
 
@@ -57,18 +58,19 @@ class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
         return f"5QI {self.value} ({self.resource_type.value})"
 
 
-class ClassIssue(msgspec.Struct, frozen=True, kw_only=True):
-    """A declared need, by its name in `check_class`, that a class does not keep."""
+class Needs(msgspec.Struct, frozen=True, kw_only=True):
+    """What a flow declares, and a class may keep; each above 0, None if it is not declared.
 
-    field: str
-    message: str
+    Attributes:
+        loss: at most 1.
+        rate_bps: bits per second that must be guaranteed.
+        max_message_size: largest message that must arrive within the delay.
+    """
 
-
-class Proposal(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to `five_qi: auto`; None if no class fits, with the reason either way."""
-
-    five_qi: FiveQi | None
-    why: str
+    max_delay_ms: float | None = None
+    loss: float | None = None
+    rate_bps: float | None = None
+    max_message_size: int | None = None
 
 
 class _FiveQiTable(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,108 +96,63 @@ def five_qi_of(value: int) -> FiveQi:
     raise ValueError(f"cannot use 5QI {value}; standardized are {known}")
 
 
-def check_class(
-    class_: FiveQi,
-    *,
-    max_delay_ms: float | None = None,
-    loss: float | None = None,
-    rate_bps: float | None = None,
-    message_bytes: int | None = None,
-) -> tuple[ClassIssue, ...]:
-    """Return what a flow declares and the class does not keep; empty if it keeps all."""
-    found: list[ClassIssue] = []
-
-    def issue(field: str, message: str) -> None:
-        found.append(ClassIssue(field=field, message=message))
-
+def check_class(class_: FiveQi, needs: Needs) -> Iterator[tuple[str, str]]:
+    """Yield each need that a class does not keep: its name in `Needs`, and a sentence."""
     budget_ms, burst = class_.packet_delay_budget_ms, class_.max_data_burst_bytes
-    if max_delay_ms is not None and max_delay_ms < budget_ms:
-        issue(
-            "max_delay_ms",
-            f"cannot keep a delay of {max_delay_ms:g} ms with {class_}: "
-            f"its packet delay budget is {budget_ms} ms",
-        )
+    delay_ms, loss, rate_bps = needs.max_delay_ms, needs.loss, needs.rate_bps
+    if delay_ms is not None and delay_ms < budget_ms:
+        which = f"a delay of {delay_ms:g} ms with {class_}"
+        yield "max_delay_ms", f"cannot keep {which}: its packet delay budget is {budget_ms} ms"
     if loss is not None and loss < class_.packet_error_rate:
-        issue(
-            "loss",
-            f"cannot keep a loss of {loss:g} with {class_}: "
-            f"its packet error rate is {class_.packet_error_rate:g}",
-        )
+        rate = f"its packet error rate is {class_.packet_error_rate:g}"
+        yield "loss", f"cannot keep a loss of {loss:g} with {class_}: {rate}"
     if rate_bps is not None and not class_.resource_type.guarantees_rate:
-        issue(
-            "rate_bps",
-            f"cannot guarantee {rate_bps:g} bit/s with {class_}: only GBR classes guarantee a rate",
-        )
+        why = f"with {class_}: only GBR classes guarantee a rate"
+        yield "rate_bps", f"cannot guarantee {rate_bps:g} bit/s {why}"
     if burst is None:
-        return tuple(found)
+        return
     served = f"with {class_}: by default it serves {burst} bytes in {budget_ms} ms"
     served_bps = burst * 8000 / budget_ms
     if rate_bps is not None and rate_bps > served_bps:
-        issue(
-            "rate_bps",
-            f"cannot keep the delay of {rate_bps:g} bit/s {served}, {served_bps:g} bit/s",
-        )
-    if message_bytes is not None and message_bytes > burst:
-        issue(
-            "message_bytes",
-            f"cannot keep the delay of a message of {message_bytes} bytes {served}",
-        )
-    return tuple(found)
+        what = f"cannot keep the delay of {rate_bps:g} bit/s"
+        yield "rate_bps", f"{what} {served}, {served_bps:g} bit/s"
+    if needs.max_message_size is not None and needs.max_message_size > burst:
+        what = f"cannot keep the delay of a message of {needs.max_message_size} bytes"
+        yield "max_message_size", f"{what} {served}"
 
 
-def propose(
-    max_delay_ms: float,
-    loss: float,
-    gbr: bool | None,
-    *,
-    message_bytes: int | None = None,
-    rate_bps: float | None = None,
-) -> Proposal:
-    """Propose the least demanding class that keeps a delay and a loss, with the reason.
+def propose(needs: Needs, gbr: bool | None) -> tuple[FiveQi | None, str]:
+    """Propose the least demanding class that keeps what a flow needs; None if none does, and why.
 
     Least demanding, because a better class than needed wastes what the network has. Classes of
     Release 16 come first, as every network knows them; then the longest delay budget, the highest
-    error rate, the least important priority. One with a doubtful cell is never proposed.
-
-    Args:
-        max_delay_ms: bound of the delay, > 0.
-        loss: bound of the loss, > 0 and <= 1.
-        gbr: True asks for a guaranteed bit rate, False for none, None for either.
-        message_bytes: largest message that must arrive within the delay, > 0.
-        rate_bps: bits per second that must be guaranteed, > 0.
+    error rate, the least important priority. One with a doubtful cell is never proposed. `gbr`:
+    True asks for a guaranteed bit rate, False for none, None for either.
     """
     fitting = [
         each
         for each in five_qis()
         if not each.flagged
         and gbr in (None, each.resource_type.guarantees_rate)
-        and not check_class(
-            each,
-            max_delay_ms=max_delay_ms,
-            loss=loss,
-            message_bytes=message_bytes,
-            rate_bps=rate_bps,
-        )
+        and not any(check_class(each, needs))
     ]
+    asked = ", ".join(
+        f"{name} {value:g}"
+        for name, value in msgspec.structs.asdict(needs).items()
+        if value is not None
+    )
     if not fitting:
-        why = f"cannot propose a 5QI: no class keeps a delay of {max_delay_ms:g} ms"
-        why += f", a loss of {loss:g}"
-        why += "" if message_bytes is None else f", messages of {message_bytes} bytes"
-        why += "" if rate_bps is None else f", {rate_bps:g} bit/s"
-        return Proposal(five_qi=None, why=why)
+        return None, f"cannot propose a 5QI: no class keeps {asked}"
 
     def undemanding(each: FiveQi) -> tuple[object, ...]:
         bounds = (each.packet_delay_budget_ms, each.packet_error_rate, each.priority_level)
         return (each.in_release_16, *bounds, -each.value)
 
     best = max(fitting, key=undemanding)
-    release = "Release 16" if best.in_release_16 else f"Release {best.first_release}"
-    return Proposal(
-        five_qi=best,
-        why=f"{best}: delay budget {best.packet_delay_budget_ms} ms <= {max_delay_ms:g} ms, error "
-        f"rate {best.packet_error_rate:g} <= {loss:g}; the least demanding class of {release} "
-        f"that fits",
-    )
+    release = 16 if best.in_release_16 else best.first_release
+    bounds = f"{best.packet_delay_budget_ms} ms, error rate {best.packet_error_rate:g}"
+    why = f"the least demanding class of Release {release} that keeps {asked}"
+    return best, f"{best}: delay budget {bounds}; {why}"
 
 
 class DscpMapping(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,9 +1,8 @@
 """DDS port arithmetic: UDP ports of a domain and participant, and how many participants fit a host.
 
 Owns: the formula of DDSI-RTPS §9.6.2.3 with its default constants, Linux's ephemeral ports, the
-limits that follow (the article *The ROS_DOMAIN_ID*), and the judgement whether so many participants
-and unique subscriptions fit on one host. These are the ports a participant asks for; a busy one is
-replaced, so the ports of a running system are read from it. Pure.
+limits that follow (the article *The ROS_DOMAIN_ID*). These are the ports a participant asks for; a
+busy one is replaced, so the ports of a running system are read from it. Pure.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import msgspec
-
-from lifecycle.printable import count
 
 PB = 7400  # port base
 DG = 250  # domain gain: the ports that one domain owns
@@ -226,48 +223,6 @@ def unique_flow_ports() -> range:
     host share these 400. Each participant takes one for `ros_discovery_info`.
     """
     return range(PB - 400, PB)
-
-
-def overflows(
-    domain_id: int,
-    *,
-    participants: int,
-    unique_subscriptions: int = 0,
-    ephemeral: EphemeralRange = LINUX,
-    host: str = "one host",
-) -> tuple[str, ...]:
-    """Return why so much does not fit on one host, one sentence per limit; empty if it fits.
-
-    Args:
-        domain_id: 0–232.
-        participants: of this domain on the host; each process has one and each unique publisher
-            one more.
-        unique_subscriptions: asked for on the host.
-        ephemeral: the host's ephemeral range.
-        host: what to call it, "machine 'robot'".
-    """
-    found: list[str] = []
-    capacity = max_participants(domain_id, ephemeral)
-    if participants > capacity.participants:
-        fit = f"{capacity.participants} fit" if capacity.participants else "none fits"
-        safe = safe_domains(ephemeral)
-        every = sum(len(run) for run in safe) > MAX_DOMAIN_ID
-        found.append(
-            f"cannot run {count(participants, 'participant')} in domain {domain_id} on {host}: "
-            f"{fit} before {capacity.limit}; use another domain, run fewer processes, "
-            f"or give fewer publishers a flow of their own"
-            + ("" if every else f" (safe domains: {describe_domains(safe)})")
-        )
-    ports = unique_flow_ports()
-    places = max(0, len(ports) - participants)  # each participant takes one
-    if unique_subscriptions > places:
-        found.append(
-            f"cannot give {count(unique_subscriptions, 'subscription')} a port of their own on "
-            f"{host}: {places} fit, because Fast DDS takes them from {ports[0]}–{ports[-1]} in "
-            f"every domain and each of {count(participants, 'participant')} takes one; "
-            f"ask for fewer unique subscriptions"
-        )
-    return tuple(found)
 
 
 def describe_domains(runs: tuple[range, ...]) -> str:

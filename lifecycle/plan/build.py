@@ -18,7 +18,14 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error, warning
+from lifecycle.manifest.diagnostics import (
+    Diagnostic,
+    ManifestError,
+    Position,
+    Severity,
+    error,
+    warning,
+)
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
@@ -58,22 +65,32 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters
-from lifecycle.plan.processes import planned_processes
-from lifecycle.plan.wiring import place, wire
+from lifecycle.plan.processes import overcrowded, planned_processes
+from lifecycle.plan.wiring import own_transports, place, wire
 from lifecycle.printable import listed
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     """Layer nodes so that each is one level below the last node it waits for.
 
-    Nodes of one level keep the manifest's order and do not wait for each other. That there is no
-    cycle is checked before (`check.after-cycle`).
+    Nodes of one level keep the manifest's order and do not wait for each other.
+
+    Raises:
+        PlanError: nodes wait for each other.
     """
     order = {node.key: index for index, node in enumerate(nodes)}
     sorter = graphlib.TopologicalSorter(
         {node.key: [each.node for each in node.after] for node in nodes}
     )
-    sorter.prepare()
+    try:
+        sorter.prepare()
+    except graphlib.CycleError as problem:
+        circle = problem.args[1][::-1]  # each waits for the one after it
+        after = nodes[order[circle[0]]].after
+        at = next(each.at for each in after if each.node == circle[1])
+        message = f"cannot order nodes that wait for each other: {' → '.join(circle)}"
+        found = error("check.after-cycle", at, message, "remove one of these 'after'")
+        raise ManifestError((found,)) from problem
     levels = []
     while ready := sorter.get_ready():
         levels.append(tuple(sorted(ready, key=order.__getitem__)))
@@ -243,7 +260,7 @@ def check_plan(
     variables = os.environ if environment is None else environment
     parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
     try:
-        _wired(manifest, variables, parameters)
+        plan = _wired(manifest, variables, parameters)
     except UsageError:
         return ()  # the environment's fault, reported where it is used
     except ManifestError as problem:
@@ -251,7 +268,7 @@ def check_plan(
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
         return (error("plan.impossible", at, problem.message, problem.hint),)
-    return tuple(_without_clock(manifest, parameters))
+    return (*overcrowded(plan, variables), *_without_clock(manifest, parameters))
 
 
 def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[Diagnostic]:
@@ -300,7 +317,11 @@ def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodePar
         levels=dependency_levels(manifest.nodes),
         rmw=variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW,
     )
-    return wire(plan, manifest.links)
+    plan = wire(plan, manifest.links)
+    crowded = overcrowded(plan, variables)
+    if refused := tuple(each for each in crowded if each.severity is Severity.ERROR):
+        raise ManifestError(refused)
+    return plan
 
 
 def effective_domain(discovery: Discovery, environment: Mapping[str, str]) -> int:
@@ -360,10 +381,7 @@ def _planned_node(
         _planned_endpoint(node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), hash_of)
         for endpoint in node.interface.endpoints
     )
-    # Only a node in our own host can be given more participants; what others start keeps its own.
-    ours = node.run.kind is RunKind.PYTHON
-    groups = needs.groups(node) if ours else ()
-    endpoints, participants = place(node.name, endpoints, node.connections, groups)
+    endpoints, participants = place(node, endpoints, needs)
     expected = parameters.expected(node)
     given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
@@ -382,7 +400,7 @@ def _planned_node(
         unread_parameter_files=parameters.unread(node),
         participants=participants,
         endpoint_policy=node.endpoints,
-        transports=needs.node_transports(node) if ours else (),
+        transports=own_transports(node, needs) if node.run.kind is RunKind.PYTHON else (),
         files=tuple(
             _planned_file(node.parameter_files, place, text, digest_of)
             for place, text in node.written_paths

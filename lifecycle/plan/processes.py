@@ -10,15 +10,15 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     DiscoveryRange,
+    EndpointKind,
     Node,
     ParameterValue,
     RosArguments,
@@ -26,7 +26,17 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.network.medium import TRANSPORTS_VARIABLE
-from lifecycle.plan.model import Plan, PlanError, PlannedProcess
+from lifecycle.network.ports import (
+    LINUX,
+    LOCALHOST_PARTICIPANTS,
+    LOCALHOST_PEERS_RANGE,
+    EphemeralRange,
+    describe_domains,
+    max_participants,
+    safe_domains,
+    unique_flow_ports,
+)
+from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
 
 
 def variables_of(plan: Plan) -> tuple[tuple[str, str], ...]:
@@ -180,7 +190,6 @@ def parameter_text(value: ParameterValue) -> str:
 
 REDACTED = "(redacted)"
 
-_Started = TypeVar("_Started", Run, PlannedProcess)
 
 _SECRET = re.compile(
     "TOKEN|SECRET|PASSW|PASSPHRASE|(^|_)PASS(_|$)|_PWD$|CREDENTIAL|PRIVATE|COOKIE"
@@ -202,11 +211,97 @@ def shown(variable: str, value: str) -> str:
 def without_secrets(plan: Plan) -> Plan:
     """Return `plan` without values of environment variables whose names say they are secret."""
     nodes = tuple(replace(each, run=_redacted(each.run)) for each in plan.nodes)
-    processes = tuple(replace(_redacted(each), run=_redacted(each.run)) for each in plan.processes)
+    processes = tuple(
+        replace(
+            each,
+            run=_redacted(each.run),
+            environment=tuple((name, shown(name, value)) for name, value in each.environment),
+        )
+        for each in plan.processes
+    )
     return replace(plan, nodes=nodes, processes=processes)
 
 
-def _redacted(of: _Started) -> _Started:
+def _redacted(run: Run) -> Run:
     return replace(
-        of, environment=tuple((name, shown(name, value)) for name, value in of.environment)
+        run, environment={name: shown(name, value) for name, value in run.environment.items()}
     )
+
+
+_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
+"""Asks for the limits that hold whatever an operating system does with its ports."""
+
+_OTHER_MEANS = (
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "ROS_DISCOVERY_SERVER",
+)
+"""Variables by which a process may find others in another way than by the range."""
+
+
+def overcrowded(plan: Plan, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+    """Yield findings about hosts with more participants than have ports, or find each other.
+
+    Counted for `range: localhost` is what certainly looks for others in the way of rmw_fastrtps:
+    the supervisor's participant, and those of processes that it starts.
+    """
+    is_local = (
+        plan.discovery_range is DiscoveryRange.LOCALHOST
+        and plan.discovery.transport.by_udp
+        and plan.rmw.startswith("rmw_fastrtps")
+        and not any(environment.get(name) for name in _OTHER_MEANS)
+    )
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION", "ROS_DOMAIN_ID", *_OTHER_MEANS}
+    by_host: dict[str, list[PlannedNode]] = {}
+    for node in plan.nodes:
+        by_host.setdefault(plan.address_of(node.machine), []).append(node)
+    for nodes in by_host.values():
+        at = plan.positions.get("discovery", nodes[0].at)
+        where = f"on {' and '.join(dict.fromkeys(repr(node.machine) for node in nodes))}"
+        participants = _participants(nodes)
+        for make, ephemeral in ((error, _NO_EPHEMERAL), (note, LINUX)):
+            room = max_participants(plan.domain_id, ephemeral)
+            if participants > room.participants:
+                message = (
+                    f"cannot run {participants} participants in domain {plan.domain_id} {where}: "
+                    f"{room.participants} fit before {room.limit}"
+                )
+                safe = describe_domains(safe_domains(LINUX))
+                hint = f"use a domain of {safe}, fewer processes, or fewer unique publishers"
+                yield make("check.ports", at, message, hint)
+                break
+        ports = unique_flow_ports()
+        subscriptions = sum(
+            each.unique.asks and each.kind is EndpointKind.SUBSCRIPTION
+            for node in nodes
+            for each in node.endpoints
+        )
+        if subscriptions > len(ports) - participants:
+            message = (
+                f"cannot give {subscriptions} subscriptions a port of their own {where}: Fast DDS "
+                f"takes them from {ports[0]}–{ports[-1]}, and one for each of {participants} "
+                "participants"
+            )
+            yield error("check.ports", at, message, "ask for fewer unique subscriptions")
+        looking = _participants(
+            node
+            for node in nodes
+            if node.run.kind is not RunKind.ATTACH and own.isdisjoint(dict(node.run.environment))
+        )
+        if is_local and looking > LOCALHOST_PARTICIPANTS:
+            message = (
+                f"cannot run {looking} participants with range localhost {where}: at most "
+                f"{LOCALHOST_PARTICIPANTS} all find each other, because each looks for participants"
+                f" 0 to {LOCALHOST_PEERS_RANGE - 1} of its host only"
+            )
+            hint = "use 'range: subnet', or give several nodes one 'process:'"
+            yield error("check.localhost", at, message, hint)
+
+
+def _participants(nodes: Iterable[PlannedNode]) -> int:
+    """Count those that take ports of the domain: the supervisor's, the nodes' and extra ones."""
+    shared, extra = set(), 0
+    for node in nodes:
+        shared.add((node.process, node.transports, node.connections))
+        extra += sum(not each.connection for each in node.participants)
+    return 1 + len(shared) + extra

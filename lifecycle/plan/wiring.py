@@ -19,7 +19,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
-from lifecycle.manifest.flows import ParticipantGroup
+from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DataLayerSource,
@@ -27,11 +27,12 @@ from lifecycle.manifest.model import (
     EndpointKind,
     FlowTransport,
     Link,
+    Node,
     RunKind,
 )
 from lifecycle.manifest.qos import Durability, Reliability
 from lifecycle.network.dscp import describe
-from lifecycle.network.medium import udp_to
+from lifecycle.network.medium import Medium, udp_to
 from lifecycle.plan.discovery import (
     Hosts,
     PortPool,
@@ -70,11 +71,22 @@ def participant_name(node_name: str, connection: str) -> str:
     return f"_{node_name}_{connection}"
 
 
+def own_transports(node: Node, needs: FlowNeeds) -> tuple[Medium, ...]:
+    """Return all that a node's own participant may use, and its subscriptions receive by.
+
+    Empty for any.
+    """
+    own = (
+        each.transports
+        for each in needs.of_node(node)
+        # A marked subscription receives on a participant beside it.
+        if each.need.kind is EndpointKind.SUBSCRIPTION and each.dscp is None and each.transports
+    )
+    return next(own, ())
+
+
 def place(
-    node_name: str,
-    endpoints: Sequence[PlannedEndpoint],
-    connections: Sequence[ConnectionDeclaration],
-    groups: Sequence[ParticipantGroup],
+    node: Node, endpoints: Sequence[PlannedEndpoint], needs: FlowNeeds
 ) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
     """Put endpoints on the connections that are declared for them, the others on what flows need.
 
@@ -83,23 +95,24 @@ def place(
     endpoints with `participant` filled in, and the participants, connections first.
     """
     places = {
-        entry: participant_name(node_name, connection.name)
-        for connection in connections
+        entry: participant_name(node.name, connection.name)
+        for connection in node.connections
         for entry in connection.map
     }
-    participants = [_connection(node_name, connection, groups) for connection in connections]
+    # Only a node in our own host can be given more participants; what others start keeps its own.
+    groups = _groups(node, needs) if node.run.kind is RunKind.PYTHON else []
+    participants = [_connection(node.name, each, groups) for each in node.connections]
     for group in groups:
-        names = tuple(name for name in group.names if (group.kind, name) not in places)
-        if names:
-            flow = participant_name(node_name, f"flow_{len(participants) - len(connections)}")
-            places |= {(group.kind, name): flow for name in names}
+        left = [each for each in group if (each.need.kind, each.need.name) not in places]
+        if left:
+            number = len(participants) - len(node.connections)
+            flow = participant_name(node.name, f"flow_{number}")
+            places |= {(each.need.kind, each.need.name): flow for each in left}
+            transports = left[0].transports or own_transports(node, needs)
+            asked = _asked(left)
+            reason = _reason(left, transports, asked["max_datagram_bytes"])
             participants.append(
-                PlannedParticipant(
-                    name=flow,
-                    reason=_reason(replace(group, names=names)),
-                    transports=group.transports,
-                    **_asked([group]),
-                )
+                PlannedParticipant(name=flow, reason=reason, transports=transports, **asked)
             )
     placed = tuple(
         replace(each, participant=places.get((each.kind, each.name), "")) for each in endpoints
@@ -107,8 +120,31 @@ def place(
     return placed, tuple(participants)
 
 
+def _groups(node: Node, needs: FlowNeeds) -> list[list[ResolvedNeed]]:
+    """Return the needs of endpoints by the extra participant that they share: as few as meet all.
+
+    A publisher that needs an NFE of its own shares with none. Others share if they ask for the
+    same; the smaller datagram size serves both. Subscriptions need one if they are marked, as
+    acknowledgements leave by the sockets of the participant; they never share with publishers,
+    whose flow a network that looks at marks must not take theirs for. Within one node only: a
+    participant belongs to a node, whose hidden node is what the graph shows.
+    """
+    found: dict[object, list[ResolvedNeed]] = {}
+    own = own_transports(node, needs)
+    for endpoint in node.interface.endpoints:
+        each = needs.of(node.key, endpoint.kind, endpoint.name)
+        if each is None or not endpoint.kind.is_topic:
+            continue
+        class_ = (each.dscp, each.five_qi, each.transports or own, each.non_blocking_send)
+        if each.unique and endpoint.kind is EndpointKind.PUBLISHER:
+            found[endpoint.name] = [each]
+        elif class_ != (None, None, own, False) or each.max_datagram_bytes is not None:
+            found.setdefault((endpoint.kind, class_), []).append(each)
+    return list(found.values())
+
+
 def _asked(
-    needs: Sequence[ParticipantGroup] | Sequence[PlannedParticipant],
+    needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant],
     marks: Sequence[int | None] = (),
 ) -> dict[str, Any]:
     """Return what a participant must do for all that it carries; it can have one mark."""
@@ -122,13 +158,14 @@ def _asked(
 
 
 def _connection(
-    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
+    node_name: str, connection: ConnectionDeclaration, groups: Sequence[Sequence[ResolvedNeed]]
 ) -> PlannedParticipant:
     """Return the participant of a connection, with what the flows of its endpoints ask for."""
     needs = [
-        group
+        each
         for group in groups
-        if {*connection.map} & {(group.kind, name) for name in group.names}
+        for each in group
+        if (each.need.kind, each.need.name) in connection.map
     ]
     return PlannedParticipant(
         name=participant_name(node_name, connection.name),
@@ -140,18 +177,22 @@ def _connection(
     )
 
 
-def _reason(group: ParticipantGroup) -> str:
-    noun = f"{group.kind.noun}{'s' if len(group.names) > 1 else ''}"
-    facts = [f"{'unique ' if group.unique else ''}{noun} {', '.join(group.names)}"]
-    if group.dscp is not None:
-        facts.append(f"marked {describe(group.dscp)}")
-    if group.five_qi is not None:
-        facts.append(f"for 5QI {group.five_qi}")
-    if group.transports:
-        facts.append(f"by {' and '.join(group.transports)} only")
-    if group.max_datagram_bytes is not None:
-        facts.append(f"in datagrams of at most {group.max_datagram_bytes} bytes")
-    if group.non_blocking_send:
+def _reason(
+    needs: Sequence[ResolvedNeed], transports: tuple[Medium, ...], datagram_bytes: int | None
+) -> str:
+    first, names = needs[0], ", ".join(each.need.name for each in needs)
+    unique = first.unique and first.need.kind is EndpointKind.PUBLISHER
+    noun = f"{first.need.kind.noun}{'s' if len(needs) > 1 else ''}"
+    facts = [f"{'unique ' if unique else ''}{noun} {names}"]
+    if first.dscp is not None:
+        facts.append(f"marked {describe(first.dscp)}")
+    if first.five_qi is not None and not first.unique:
+        facts.append(f"for 5QI {first.five_qi}")
+    if transports:
+        facts.append(f"by {' and '.join(transports)} only")
+    if datagram_bytes is not None:
+        facts.append(f"in datagrams of at most {datagram_bytes} bytes")
+    if first.non_blocking_send:
         facts.append("sent without waiting")
     return " ".join(facts)
 

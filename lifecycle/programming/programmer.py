@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -19,13 +20,14 @@ from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
 from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, Treatment, flow_rules
 from lifecycle.programming.target import (
-    Chosen,
     Means,
     PartlyError,
+    Program,
     T,
     Target,
     TargetChanges,
     each_done,
+    read_targets,
     target_kind,
 )
 from lifecycle.run_directory import is_held, run_name, runtime_root
@@ -36,20 +38,30 @@ _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""
 
 
-def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
-    """Return what a person asked for; `mapping` is the name or the file of one, empty for none.
+def read_program(names: Iterable[str], given: Mapping[str, Any], *, option: str) -> Program:
+    """Return the networks that a person asked for, and what flows get in them.
+
+    Args:
+        names: of targets.
+        given: values of options; `mapping` is the name or the file of a 5QI to DSCP mapping.
+        option: that names are given by.
 
     Raises:
-        UsageError: no such mapping, or its file cannot be used.
+        UsageError: they do not fit together, or cannot be used.
     """
+    given = dict(given)
+    mapping, label_flows = given.pop("mapping", ""), given.pop("flow_labels", False)
+    chosen = read_targets(names, given, option=option)
+    if not chosen:
+        raise UsageError(f"cannot use --dscp-from-5qi or --flow-labels without {option}")
     if not mapping:
-        return Treatment(label_flows=label_flows)
+        return Program(chosen, Treatment(label_flows=label_flows))
     try:
         file = Path(mapping)
         found = parse_mapping(file.read_bytes()) if file.is_file() else dscp_mapping(mapping)
     except (OSError, ValueError) as error:
         raise UsageError(str(error)) from error
-    return Treatment(mapping=found, label_flows=label_flows)
+    return Program(chosen, Treatment(mapping=found, label_flows=label_flows))
 
 
 def route_sources(plan: Plan, machine: str = "") -> SourceAddress:
@@ -197,22 +209,20 @@ class Programmer:
 
 def open_programmer(
     plan: Plan,
-    chosen: Sequence[Chosen],
+    program: Program,
     *,
     environment: Mapping[str, str],
     machine: str = "",
     owned: bool = False,
-    treatment: Treatment | None = None,
 ) -> Programmer:
     """Return a programmer for this host.
 
     Args:
         plan: of the system.
-        chosen: the networks to program.
+        program: the networks to program, and how.
         environment: says where run directories are.
         machine: the machine that this host is; empty to determine it by its addresses.
         owned: the caller is the supervisor whose end is to end what is made.
-        treatment: see Treatment.
 
     Raises:
         UsageError: options or settings cannot be used.
@@ -221,10 +231,10 @@ def open_programmer(
     means = Means(Ledger(directory, plan.system, owned=owned))
     return Programmer(
         plan,
-        [each.open(means) for each in chosen],
+        [each.open(means) for each in program.targets],
         means,
         source_address=route_sources(plan, machine),
-        treatment=treatment,
+        treatment=program.treatment,
     )
 
 

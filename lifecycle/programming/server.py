@@ -145,6 +145,7 @@ class ServerTarget(Target):
         settings_type: of its key in the settings file.
     """
 
+    takes = ("config",)
     hint = "give --config FILE"
     collection: ClassVar[str]
     settings_type: ClassVar[type[ServerSettings]]

@@ -14,16 +14,13 @@ import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming import TARGETS
-from lifecycle.programming.rules import FlowRule, RuleSet
+from lifecycle.programming.rules import FlowRule, RuleSet, Treatment
 
 if TYPE_CHECKING:
     from lifecycle.programming.ledger import Ledger, TargetRecord
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-_TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
-"""Targets → options that only they take."""
 
 
 class ChangeKind(enum.Enum):
@@ -117,11 +114,13 @@ class Target(abc.ABC):
 
     Attributes:
         kind: name of the target.
+        takes: options that it reads.
         hint: how to give what it cannot do without; empty if there is nothing such.
         name: for people: "nft table inet flowqos_teleop".
     """
 
     kind: ClassVar[str]
+    takes: ClassVar[tuple[str, ...]] = ()
     hint: ClassVar[str] = ""
     name: str
 
@@ -197,6 +196,19 @@ class Chosen(msgspec.Struct, frozen=True):
         return self.target(self.settings, means)
 
 
+class Program(msgspec.Struct, frozen=True):
+    """The networks that a person asked for, and what flows get in them."""
+
+    targets: tuple[Chosen, ...]
+    treatment: Treatment = Treatment()
+
+    @property
+    def token_variables(self) -> frozenset[str]:
+        """The environment variables that hold tokens."""
+        found = (each.target.token_variables(each.settings) for each in self.targets)
+        return frozenset[str]().union(*found)
+
+
 def target_kind(name: str) -> type[Target]:
     """Return the class of a target.
 
@@ -217,18 +229,14 @@ def read_targets(
     Raises:
         UsageError: they do not fit together.
     """
-    chosen = tuple(dict.fromkeys(names))
-    for those, flags in _TAKEN.items():
-        if not {*those} & {*chosen} and any(given.get(each) for each in flags):
-            needs = _either([f"--{each}" for each in flags])
-            raise UsageError(f"cannot use {needs} without {option} {_either(those)}")
-    kinds = map(target_kind, chosen)
+    kinds = [target_kind(each) for each in dict.fromkeys(names)]
+    taken = {flag for each in kinds for flag in each.takes}
+    for flag, value in given.items():
+        if value and flag not in taken:
+            chosen = ", ".join(each.kind for each in kinds)
+            why = f"with {option} {chosen}" if chosen else f"without {option}"
+            raise UsageError(f"cannot use --{flag} {why}")
     return tuple(Chosen(each, each.read(given)) for each in kinds)
-
-
-def _either(words: Sequence[str]) -> str:
-    *most, last = words
-    return f"{', '.join(most)} or {last}" if most else last
 
 
 async def each_done(

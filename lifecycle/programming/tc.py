@@ -298,6 +298,7 @@ class TcTarget(host.TableTarget):
     """One device."""
 
     kind = "tc"
+    takes = ("device", "rate", "guarantee", "queue", "match")
     hint = "give --device eth0 --rate 20mbit"
 
     def __init__(

@@ -29,24 +29,21 @@ from lifecycle.verify.verdict import FlowReport
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
     from lifecycle.programming.programmer import Programmer
-    from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen
+    from lifecycle.programming.target import Program
     from lifecycle.supervisor.run.looking import JudgedSystem
 
 
-def export(
-    plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment | None
-) -> None:
+def export(plan: Plan, flows: Sequence[FlowReport], program: Program) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
         UsageError: it cannot be exported so.
     """
-    programmer = _open(plan, (network,), treatment)
+    programmer = _open(plan, program)
     try:
         text = programmer.export(flows)
     except ValueError as error:
-        raise UsageError(str(error), hint=network.target.hint) from error
+        raise UsageError(str(error), hint=program.targets[0].target.hint) from error
     click.echo(text, nl=False)
     _show_left_out(programmer.left_out)
 
@@ -124,14 +121,8 @@ def _show(
         raise UsageError("cannot use --record with --watch or --export; run each by itself")
     if watch and export_ is not None:
         raise UsageError("cannot use --export with --watch; export once")
-    if export_ is not None:
-        # What is exported for a network takes what programming it takes.
-        (network,), treatment = common.read_networks((export_,), rest, option="--export")
-    elif any(rest.values()):
-        raise UsageError(
-            "cannot say how to treat flows that are only shown",
-            hint="give --export, or use lifecycle flows apply",
-        )
+    # What is exported for a network takes what programming it takes.
+    program = common.read_networks((export_,) if export_ else (), rest, option="--export")
     plan = _plan_of(target, assignments)
     if record is not None:
         return _record(plan, Record(record))
@@ -146,8 +137,8 @@ def _show(
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         common.say(each)
-    if export_ is not None:
-        export(seen.plan, seen.verdict.flows, network, treatment)
+    if program is not None:
+        export(seen.plan, seen.verdict.flows, program)
     else:
         flows, measured = seen.verdict.flows, seen.verdict.measured
         click.echo(render_flows(flows, format_, measured, colour=sys.stdout.isatty()))
@@ -232,14 +223,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
         return look(path).plan
 
 
-def apply(
-    plan: Plan,
-    flows: Sequence[FlowReport],
-    options: Sequence[Chosen],
-    *,
-    dry_run: bool,
-    treatment: Treatment | None = None,
-) -> bool:
+def apply(plan: Plan, flows: Sequence[FlowReport], program: Program, *, dry_run: bool) -> bool:
     """Program the networks with the verified flows, and say what was done.
 
     What is made stays until `remove`, or until the system is brought down.
@@ -249,7 +233,7 @@ def apply(
     """
     from lifecycle.programming.target import PartlyError
 
-    programmer = _open(plan, options, treatment)
+    programmer = _open(plan, program)
     try:
         changes = asyncio.run(programmer.diff(flows) if dry_run else programmer.update(flows))
     except PartlyError as error:
@@ -300,8 +284,8 @@ def _apply(
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     Where a manifest declares a delay, a rate or a loss, it is measured before and after.
     """
-    options, treatment = common.read_networks(targets, rest, option="--target")
-    if not options:
+    program = common.read_networks(targets, rest, option="--target")
+    if program is None:
         raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
     from lifecycle.supervisor.run.looking import judge_running, with_supervisors_numbers
 
@@ -311,7 +295,7 @@ def _apply(
     for each in seen.notices:
         common.say(each)
     flows = seen.verdict.flows
-    changed = apply(seen.plan, flows, options, dry_run=dry_run, treatment=treatment)
+    changed = apply(seen.plan, flows, program, dry_run=dry_run)
     if changed and dry_run:
         return ExitCode.VIOLATED
     if changed and plan.bounds:
@@ -361,10 +345,10 @@ def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     return remove(common.load_plan(manifest, assignments))
 
 
-def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
+def _open(plan: Plan, program: Program) -> Programmer:
     from lifecycle.programming.programmer import open_programmer
 
-    return open_programmer(plan, options, environment=os.environ, treatment=treatment)
+    return open_programmer(plan, program, environment=os.environ)
 
 
 def _show_left_out(flows: Iterable[str]) -> None:

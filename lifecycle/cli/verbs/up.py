@@ -113,12 +113,11 @@ def command(
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            program, treatment = common.read_networks(targets, rest, option="--program")
-            # Secrets of networks, which nothing that is started shall have.
-            tokens = (each.target.token_variables(each.settings) for each in program)
-            # It imports while we do and read the manifest.
+            program = common.read_networks(targets, rest, option="--program")
+            # It imports while we do and read the manifest. Nothing that is started has a token.
             process = ForkServerProcess(
-                without=frozenset[str]().union(*tokens), programs=bool(program)
+                without=program.token_variables if program else frozenset(),
+                programs=program is not None,
             )
             try:
                 plan = common.load_plan(manifest, assignments, machine=machine, domain_id=domain)
@@ -141,7 +140,6 @@ def command(
                     keep_going=keep_going,
                     adopt=adopt,
                     program=program,
-                    treatment=treatment,
                 )
                 with output(format_) as listener, ending.noted():
 

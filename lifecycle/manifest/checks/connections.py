@@ -9,8 +9,6 @@ import functools
 import re
 from collections.abc import Iterator
 
-import msgspec
-
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest import installed_types
 from lifecycle.manifest.checks.system import (
@@ -20,8 +18,6 @@ from lifecycle.manifest.checks.system import (
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.model import (
-    Authority,
-    ConnectionDeclaration,
     DiscoveryMode,
     EndpointKind,
     EndpointPolicy,
@@ -30,8 +26,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.network.connection_url import ConnectionUrlError, check_together
-from lifecycle.network.nfe import may_be_same
-from lifecycle.network.ports import DG, domain_base, owner_of
 
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",
@@ -69,22 +63,6 @@ def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield make(_RULES[kind], each.at, message, hint)
 
 
-_FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
-
-
-def check_foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Yield a finding about connections of a node that makes its participants itself."""
-    supervised = system.manifest.data_layer.authority is Authority.SUPERVISOR
-    if not node.connections or node.run.kind is RunKind.PYTHON or (supervised and node.managed):
-        return  # of a managed one its ~/connect_to service is called, if it has one
-    message = f"cannot connect {node.key!r}: its participants are its own code's to make"
-    hint = "write it as 'run: {python: module:Class}'"
-    if not supervised:
-        hint += ", or use 'data_layer: {authority: supervisor}' if it has ~/connect_to"
-    at = node.where(f"connections.{node.connections[0].name}")
-    yield error("check.connection-foreign", at, message, hint)
-
-
 def check_mapped(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Judge what the connections of a node carry."""
     rule = "check.connection-endpoint"
@@ -110,45 +88,15 @@ def check_mapped(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
                 yield error(rule, at, message, hint)
 
 
-def check_connection_names(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about names of connections that something else has."""
-    rule, mode = "check.connection-name", system.manifest.discovery.mode
-    hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
-    declared = ((node, each) for node in system.manifest.nodes for each in node.connections)
-    for node, connection in declared:
-        reserved = ""
-        if _FLOW_NAME.match(connection.name):
-            reserved = "it names a participant that tells a flow apart"
-        if connection.name == "data" and mode is DiscoveryMode.STATIC_ENDPOINTS:
-            reserved = "in discovery mode static_endpoints it carries every topic"
-        if reserved:
-            message = f"cannot name a connection {connection.name!r}: {reserved}"
-            yield error(rule, connection.at, message, "choose another name")
-        namespace, _, base = node.full_name.rpartition("/")
-        name = f"{namespace}/_{base}_{connection.name}"
-        owner, other = hidden.setdefault(name, (node, connection))
-        if other is not connection:
-            message = (
-                f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
-                f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
-                f"({other.at.spelled})"
-            )
-            yield error(rule, connection.at, message, "choose another name")
-
-
-def check_lossy(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Judge data that must arrive against the connection that carries them."""
+def check_connection_names(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+    """Yield findings about names of connections that participants of the planner have."""
+    taken = "flow_[0-9]+"
+    if system.manifest.discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
+        taken = f"{taken}|data"  # which carries every topic
     for connection in node.connections:
-        groups_only = all(url.transport.is_group for url in connection.urls)
-        for kind, name in connection.map if groups_only else ():
-            each = system.needs.of(node.key, kind, name)
-            if each is not None and each.need.lossy is False:
-                message = (
-                    f"cannot carry {kind.noun} {name!r}, whose data are declared not lossy, by "
-                    f"multicast alone, as connection {connection.name!r} does"
-                )
-                hint = "add 'tcpv4://' or 'udpv4://' to it, or remove 'lossy: false'"
-                yield error("check.connection-flow", each.need.at, message, hint)
+        if re.fullmatch(taken, connection.name):
+            message = f"cannot name a connection {connection.name!r}: the planner has one"
+            yield error("check.connection-name", connection.at, message, "choose another name")
 
 
 _MANUAL = "MANUAL_BY_TOPIC"
@@ -258,88 +206,25 @@ def check_types(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield error("check.type-mismatch", each.at, message, "use one type at all ends")
 
 
-class _Use(msgspec.Struct, frozen=True, kw_only=True):
-    """One port that a URL opens."""
-
-    host: str
-    tcp: bool
-    group: bool
-    address: str
-    port: int
-    what: str
-    at: Position
-
-
 def check_connection_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about ports in URLs that something else has."""
-    uses = list(_uses(system))
-    yield from _port_collisions(uses)
-    yield from _well_known(system, uses)
-
-
-def _uses(system: DeclaredSystem) -> Iterator[_Use]:
+    """Yield findings about ports that two URLs of one host open."""
+    first: dict[tuple[str, bool, str, int], Position] = {}
     urls = (
-        (node, connection, index, url)
+        (node, url, node.where(f"connections.{connection.name}.urls.{index}"))
         for node in system.manifest.nodes
         for connection in node.connections
         for index, url in enumerate(connection.urls)
     )
-    for node, connection, index, url in urls:
-        group = url.transport.is_group
-        for attribute in ("port", "metatraffic_port", "output_port"):
-            word = attribute.replace("_", " ")
-            if (port := getattr(url, attribute)) is not None:
-                yield _Use(
-                    host=system.manifest.address_of(node.machine),
-                    tcp=url.transport.is_tcp,
-                    group=group and attribute == "port",
-                    address="" if group or attribute == "output_port" else url.address,
-                    port=port,
-                    what=f"{word} of connection {connection.name!r} of {node.key!r}",
-                    at=node.where(f"connections.{connection.name}.urls.{index}"),
-                )
-
-
-def _port_collisions(uses: list[_Use]) -> Iterator[Diagnostic]:
-    seen: dict[tuple[str, bool, int], list[_Use]] = {}
-    for use in uses:
-        for other in seen.setdefault((use.host, use.tcp, use.port), []):
-            if use.group and other.group:
-                continue
-            one, two = use.address or "0.0.0.0", other.address or "0.0.0.0"  # noqa: S104 - a name
-            if may_be_same(one, two, same_machine=True):
-                protocol = "TCP" if use.tcp else "UDP"
-                message = (
-                    f"cannot give {protocol} port {use.port} to the {use.what}: it is the "
-                    f"{other.what} ({other.at.spelled})"
-                )
-                yield error("check.connection-ports", use.at, message, "choose another port")
-                break
-        seen[use.host, use.tcp, use.port].append(use)
-
-
-def _well_known(system: DeclaredSystem, uses: list[_Use]) -> Iterator[Diagnostic]:
-    """Judge ports that participants of the system's own domain take by themselves."""
-    discovery = system.manifest.discovery
-    domain = discovery.domain_id or 0
-    if discovery.mode is not DiscoveryMode.DYNAMIC or not discovery.transport.by_udp:
-        return
-    for use in uses:
-        owner = None if use.tcp else owner_of(use.port)
-        if owner is None or owner.domain_id != domain:
-            continue
-        whose = (
-            "every participant"
-            if owner.participant_id is None
-            else f"participant {owner.participant_id}"
-        )
-        message = (
-            f"cannot give UDP port {use.port} to the {use.what}: in domain {domain} it is the "
-            f"{owner.role.replace('_', ' ')} port of {whose}"
-        )
-        base = domain_base(domain)
-        hint = f"choose a port outside of {base}–{min(base + DG - 1, 65535)}"
-        yield error("check.connection-ports", use.at, message, hint)
+    for node, url, at in urls:
+        ports = [url.metatraffic_port, url.output_port]
+        ports += [] if url.transport.is_group else [url.port]  # which many may listen to
+        for port in filter(None, ports):
+            host = system.manifest.address_of(node.machine)
+            key = (host, url.transport.is_tcp, url.address, port)
+            other = first.setdefault(key, at)
+            if other is not at:
+                message = f"cannot open port {port} twice on a host: {other.spelled} does, too"
+                yield error("check.connection-ports", at, message, "choose another port")
 
 
 def check_urls(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
@@ -356,7 +241,6 @@ CHECKS = (
     check_types,
     check_qos,
     check_counterparts,
-    check_connection_names,
     check_connection_ports,
 )
-OF_A_NODE = (check_mapped, check_foreign, check_lossy, check_urls)
+OF_A_NODE = (check_mapped, check_connection_names, check_urls)

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
-from lifecycle.manifest.diagnostics import Diagnostic, error, note, warning
-from lifecycle.manifest.flows import ResolvedNeed
+from lifecycle.manifest.diagnostics import Diagnostic, error, note
 from lifecycle.manifest.model import (
     QUANTILE,
     EndpointKind,
@@ -15,12 +14,11 @@ from lifecycle.manifest.model import (
     Link,
     Node,
     Quantity,
-    RunKind,
     UniqueHow,
 )
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
-from lifecycle.network.dscp import MappedPriority, describe
+from lifecycle.network.dscp import ECN_MASK, describe
 from lifecycle.network.nfe import UniqueRequirement
 
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -55,17 +53,15 @@ def check_flows(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
             )
             hint = "make it RELIABLE, or mark the publishers of the topic"
             yield note("check.flow-dscp", need.at, message, hint)
-        if each.priority is not None:
-            yield from _priority(need, each.priority)
+        if need.transport_priority is not None:
+            yield from _priority(need, each.tos)
         message, hint = each.flow_class.problem
         if message:
             yield error("check.flow-five-qi", need.at, message, hint)
-        for issue in () if message else each.flow_class.issues:
-            make = error if issue.field in _KEPT_BY_CLASS else note
+        for field, issue in each.flow_class.issues:
+            make = error if field in _KEPT_BY_CLASS else note
             hint = "choose another class, or write 'five_qi: auto'"
-            yield make("check.five-qi-class", need.at, issue.message, hint)
-        if node.run.kind is not RunKind.PYTHON:
-            yield from _foreign(node, each)
+            yield make("check.five-qi-class", need.at, issue, hint)
 
 
 def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
@@ -81,8 +77,8 @@ def _unknown(node: Node, need: FlowNeed) -> Diagnostic:
     return error("check.flow-unknown-endpoint", need.at, message, hint)
 
 
-def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
-    """Say what a 'transport_priority' cannot be, and which of its bits get lost."""
+def _priority(need: FlowNeed, tos: int | None) -> Iterator[Diagnostic]:
+    """Say what a 'transport_priority' cannot be."""
     number = need.transport_priority or 0
     priority = f"transport_priority {number} ({number:#x})"
     if need.dscp is not None:
@@ -92,44 +88,13 @@ def _priority(need: FlowNeed, mapped: MappedPriority) -> Iterator[Diagnostic]:
         )
         hint = f"keep one; the one is {describe(need.dscp)}, the other {priority}"
         yield error("check.flow-dscp", need.at, message, hint)
-    elif mapped.tos is None:
-        message = f"cannot mark anything with {priority}: the mask is 0"
-        yield note("check.transport-priority", need.at, message, "")
-    elif mapped.sets_ecn:
+    elif tos is not None and tos & ECN_MASK:
         message = (
-            f"cannot use {priority}: it is TOS {mapped.tos} ({mapped.tos:#04x}), whose two lowest "
-            f"bits are ECN and belong to the transport (RFC 3168)"
+            f"cannot use {priority}: it is TOS {tos} ({tos:#04x}), whose two lowest bits are ECN "
+            f"and belong to the transport (RFC 3168)"
         )
-        hint = f"without them it is {describe(mapped.tos >> 2)}"
+        hint = f"without them it is {describe(tos >> 2)}"
         yield error("check.flow-dscp", need.at, message, hint)
-    elif mapped.ignored_bits:
-        message = (
-            f"cannot map bits {mapped.ignored_bits:#x} of {priority}: the mask leaves them out"
-        )
-        hint = f"what is left is {describe(mapped.tos >> 2)}"
-        yield note("check.transport-priority", need.at, message, hint)
-
-
-def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    """Judge needs of a node that others start: it keeps the one participant that it makes."""
-    need = each.need
-    what = f"{need.kind.noun} {need.name!r} of {node.key!r}"
-    hint = "write it as 'run: {python: module:Class}'"
-    if need.unique is UniqueRequirement.STRICTLY_REQUIRED and need.kind is EndpointKind.PUBLISHER:
-        message = (
-            f"cannot make {what} strictly unique: no RMW does that for a publisher, and only a "
-            f"node with 'run: python' can be given a participant of its own"
-        )
-        yield error("check.flow-impossible", need.at, message, hint)
-    elif each.unique:
-        message = f"cannot make {what} unique from outside: its own code must ask for it"
-        yield warning("check.flow-foreign", need.at, message, hint)
-    if each.dscp is not None:
-        message = f"cannot mark {what} with a DSCP: only a node with 'run: python' can be marked"
-        yield warning("check.flow-foreign", need.at, message, hint)
-    if need.non_blocking_send:
-        message = f"cannot make {what} send without waiting: its participant is not ours"
-        yield warning("check.flow-blocks", need.at, message, hint)
 
 
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}

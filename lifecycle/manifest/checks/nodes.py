@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
@@ -279,7 +279,7 @@ def check_container(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
 
 def check_order(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Yield findings about what a node waits for."""
-    for after in _once(node.after):
+    for after in {each.node: each for each in reversed(node.after)}.values():
         other = system.nodes.get(after.node)
         if other is None:
             message = f"cannot wait for node {after.node!r}: there is no such node"
@@ -290,11 +290,6 @@ def check_order(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
             yield error("check.after-self", after.at, message, "remove it")
         elif isinstance(after.condition, Condition):
             yield from _never_holds(node, other, after.condition, after.at)
-
-
-def _once(afters: Iterable[After]) -> list[After]:
-    """Return the first for each node that is waited for: of what it shows there may be several."""
-    return [*{each.node: each for each in reversed([*afters])}.values()][::-1]
 
 
 def _never_holds(
@@ -328,30 +323,6 @@ _FURTHEST = {
     TargetState.ACTIVE: Condition.HEALTHY,
 }
 """How far the supervisor brings a node that is kept in a state."""
-
-
-def check_cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Report each circle once, at the edge that closes it; iterative, so depth has no limit."""
-    edges = {
-        key: [each for each in _once(node.after) if each.node in system.nodes and each.node != key]
-        for key, node in system.nodes.items()
-    }
-    done: set[str] = set()
-    for root in system.nodes:
-        path: dict[str, Iterator[After]] = {} if root in done else {root: iter(edges[root])}
-        while path:
-            key, pending = next(reversed(path.items()))
-            after = next(pending, None)
-            if after is None:
-                del path[key]
-                done.add(key)
-            elif after.node in path:
-                keys = list(path)
-                circle = [*keys[keys.index(after.node) :], after.node]
-                message = f"cannot order nodes that wait for each other: {' → '.join(circle)}"
-                yield error("check.after-cycle", after.at, message, "remove one of these 'after'")
-            elif after.node not in done:
-                path[after.node] = iter(edges[after.node])
 
 
 def check_readiness(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
@@ -419,7 +390,7 @@ def _ready_parameter(
         yield error("check.after-value", after.at, why, "leave that value out")
 
 
-CHECKS = (check_cycles, check_processes, check_on_violation, check_modes)
+CHECKS = (check_processes, check_on_violation, check_modes)
 OF_A_NODE = (
     check_order,
     check_machine,

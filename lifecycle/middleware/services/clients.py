@@ -196,7 +196,8 @@ class NodeClients:
 
         async def load() -> int:
             package, _, plugin = node.run.component.partition("/")
-            extra = (Parameter(name, value=value) for name, value in node.run.extra_arguments)
+            given = node.run.extra_arguments.items()
+            extra = (Parameter(name, value=value) for name, value in given)
             response = await ask(
                 "load_node",
                 services.LoadNode,

@@ -346,7 +346,7 @@ def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
     """Return what a class or function is called with; one that needs a `node_name` gets it."""
     keywords = {
         name: list(value) if isinstance(value, tuple) else value
-        for name, value in planned.run.arguments
+        for name, value in planned.run.arguments.items()
     }
     wanted = inspect.signature(what).parameters.get("node_name")
     named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)

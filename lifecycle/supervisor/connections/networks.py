@@ -183,7 +183,7 @@ def open_networks(
         KeyboardInterrupt: while a server was asked to remove what is left of a dead run.
     """
     path = directory.path
-    if not options.program:
+    if options.program is None:
         return Networks(plan.system, path, emit)
     from lifecycle.programming.programmer import open_programmer, sweep_orphans
 
@@ -193,7 +193,6 @@ def open_networks(
         environment=environment,
         machine=options.machine,
         owned=True,
-        treatment=options.treatment,
     )
 
     def report(text: str) -> None:

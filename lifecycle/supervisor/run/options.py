@@ -24,8 +24,7 @@ from lifecycle.verify.verdict import Verdict
 from lifecycle.verify.view import only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.programming.rules import Treatment
-    from lifecycle.programming.target import Chosen
+    from lifecycle.programming.target import Program
 
 
 TIMEOUT_S = 30.0
@@ -56,7 +55,6 @@ class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
         machine: run only this machine's nodes; empty runs all whose address is local.
         keep_going: report a dead process, but do not take the others down.
         program: networks to program with the verified flows for as long as the system is active.
-        treatment: what their flows get beyond what the manifest says.
         adopt: take nodes that run already as they are found, and start only the others.
     """
 
@@ -66,8 +64,7 @@ class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
     strict: bool = False
     machine: str = ""
     keep_going: bool = False
-    program: tuple[Chosen, ...] = ()
-    treatment: Treatment | None = None
+    program: Program | None = None
     adopt: bool = False
 
     @property

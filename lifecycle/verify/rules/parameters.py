@@ -298,7 +298,7 @@ _NO_NODE = frozenset(
 _JUDGED = frozenset(
     (
         *("check.qos-doubtful", "check.type-not-installed", "check.parameter-empty-array"),
-        *("check.flow-foreign", "check.flow-transport", "check.ipv6-transports"),
+        *("check.flow-foreign", "check.flow-transport"),
         "yaml.tag",
     )
 )

@@ -10,8 +10,7 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import flows as verb
 from lifecycle.cli.verbs import up
 from lifecycle.programming import TARGETS
-from lifecycle.programming.programmer import read_treatment
-from lifecycle.programming.target import read_targets
+from lifecycle.programming.programmer import read_program
 from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.flow_samples import plan, report
 from tests.unit.programming.samples import camara_settings, nef_settings, settings_file
@@ -19,8 +18,8 @@ from tests.unit.programming.samples import camara_settings, nef_settings, settin
 
 def export(name: str, *flows: FlowReport, **given: object) -> None:
     """Export flows for a network, `given` what it takes."""
-    (network,) = read_targets((name,), given, option="--export")
-    verb.export(plan(), flows or [report()], network, read_treatment("", label_flows=False))
+    program = read_program((name,), given, option="--export")
+    verb.export(plan(), flows or [report()], program)
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -50,15 +49,9 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(
         (["--export", "nft", "--watch"], "cannot use --export with --watch; export once"),
         (
             ["--export", "nft", "--device", "e0"],
-            "cannot use --device, --rate or --guarantee without --export tc",
+            "cannot use --device with --export nft",
         ),
-        (
-            ["--device", "e0"],
-            (
-                "cannot say how to treat flows that are only shown; give --export, or use "
-                "lifecycle flows apply"
-            ),
-        ),
+        (["--device", "e0"], "cannot use --device without --export"),
     ],
 )
 def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
@@ -70,7 +63,7 @@ def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--device", "e0"], "cannot use --device, --rate or --guarantee without --program tc"),
+        (["--device", "e0"], "cannot use --device without --program"),
         (["--flow-labels"], "cannot use --dscp-from-5qi or --flow-labels without --program"),
     ],
 )

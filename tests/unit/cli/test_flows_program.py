@@ -10,8 +10,8 @@ from click.testing import CliRunner
 
 from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.programming.programmer import read_treatment
-from lifecycle.programming.target import Chosen, ProgrammingError, read_targets
+from lifecycle.programming.programmer import read_program
+from lifecycle.programming.target import Program, ProgrammingError, read_targets
 from lifecycle.run_directory import RunDirectory
 from tests.builders import nfe
 from tests.unit.programming.flow_samples import plan, report
@@ -20,16 +20,16 @@ from tests.unit.programming.servers import TOKEN, NefServer
 
 
 @pytest.fixture
-def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Chosen, ...]:
-    """A NEF that is named in the environment's own run directory; its server is not there."""
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run directory of its own, and a token."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TEST_TOKEN", TOKEN)
-    return ()
 
 
-def nef_options(tmp_path: Path, url: str) -> tuple[Chosen, ...]:
+def nef_options(tmp_path: Path, url: str) -> Program:
     settings = nef_settings(url, devices=["10.77.0.1"])
-    return (read_targets(["nef"], {"config": settings_file(tmp_path, nef=settings)})[0],)
+    given = {"config": settings_file(tmp_path, nef=settings)}
+    return read_program(["nef"], given, option="--target")
 
 
 def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown(
@@ -66,9 +66,9 @@ def test_options_of_tc_are_read_with_their_units() -> None:
         (
             ["nft"],
             {"device": "e0"},
-            "cannot use --device, --rate or --guarantee without --target tc",
+            "cannot use --device with --target nft",
         ),
-        (["nft"], {"config": "f"}, "cannot use --config without --target nef or camara"),
+        (["nft"], {"config": "f"}, "cannot use --config with --target nft"),
         (["tc"], {"device": "e0", "rate": "fast"}, "cannot use rate 'fast'"),
         (["tc"], {"device": "e0", "rate": "1mbit", "queue": "50"}, "cannot use queue '50'"),
         (["tc"], {"device": "e0", "queue": "50ms"}, "cannot program tc without the rate"),
@@ -93,13 +93,14 @@ def test_a_5qi_mapping_is_one_of_ours_or_a_file(tmp_path: Path) -> None:
     file = tmp_path / "mapping.json"
     file.write_text('{"name": "own", "source": "us", "values": {"85": "EF"}}')
 
-    own = read_treatment(str(file), label_flows=True)
+    given = {"mapping": str(file), "flow_labels": True}
+    own = read_program(["nft"], given, option="--target").treatment
 
     assert own.label_flows
     assert own.mapping is not None
     assert own.mapping.dscp_for(85) == 46
     with pytest.raises(UsageError, match="cannot find 5QI to DSCP mapping 'nope'"):
-        read_treatment("nope", label_flows=False)
+        read_program(["nft"], {"mapping": "nope"}, option="--target")
 
 
 @pytest.mark.usefixtures("options")

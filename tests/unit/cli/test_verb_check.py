@@ -119,21 +119,21 @@ discovery: {mode: static, transport: shm}
 nodes:
   called:
     run: {python: "demo:Called"}
-    interface: {service_servers: [{name: /reset, type: std_srvs/srv/Trigger}]}
+    interface: {publishers: [{name: /data, type: std_msgs/msg/String}]}
     connections: {net: {urls: ["udpv4://127.0.0.1:9001?multicast=off"], map: all}}
   caller:
     run: {python: "demo:Caller"}
-    interface: {service_clients: [{name: /reset, type: std_srvs/srv/Trigger}]}
+    interface: {subscriptions: [{name: /data, type: std_msgs/msg/String}]}
 """,
         encoding="utf-8",
     )
     assert main(["check", str(path)]) == 3
     assert capsys.readouterr().out.splitlines() == [
         (
-            f"{path}:11:35: nodes.caller.interface.service_clients[0]: cannot call service "
-            "'/reset' of 'called' from 'caller': the client's participant has shm, the server's "
-            "udpv4, and they are on one host; map both ends onto connections that have a "
-            "transport in common"
+            f"{path}:7:30: nodes.called.interface.publishers[0]: cannot carry '/data' from "
+            "'called' to 'caller' by shm: the publisher's participant has udpv4, the "
+            "subscription's shm, so it would not arrive; ask for one transport for all "
+            "that these two endpoints talk to"
         ),
         f"{path}: not ok (1 error)",
     ]

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.diagnostics import ManifestError
-from lifecycle.manifest.loading import Loaded, load
+from lifecycle.manifest.loading import load
+from lifecycle.plan.build import check_plan
 
 FILE = "s.lifecycle.yaml"
 
@@ -18,7 +19,7 @@ Findings = Callable[..., list[str]]
 
 @pytest.fixture
 def findings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Findings:
-    """Return the findings of a manifest, each as its rule and its text, without the file's name.
+    """Return what `check` finds in a manifest, each as rule and text, without the file's name.
 
     The text starts below `manifest_version` and `system`; further files are given by keyword with
     underscores for dots.
@@ -31,10 +32,10 @@ def findings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Findings:
         header = "manifest_version: 1\nsystem: s\n"
         Path(FILE).write_text(header + textwrap.dedent(text).lstrip("\n"))
         try:
-            found: Loaded | ManifestError = load(FILE)
+            loaded = load(FILE)
+            each_of = (*loaded.warnings, *check_plan(loaded.manifest, files=loaded.files))
         except ManifestError as error:
-            found = error
-        each_of = found.warnings if isinstance(found, Loaded) else found.diagnostics
+            each_of = error.diagnostics
         return [f"{each.rule} {each}".replace(f"{FILE}:", "") for each in each_of]
 
     return find

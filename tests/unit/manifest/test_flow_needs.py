@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup
+from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     EndpointKind,
@@ -15,10 +15,13 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Machine,
     Network,
+    Node,
 )
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import PlannedNode, PlannedParticipant
 from tests.builders import at, link, manifest, need, node, publisher, subscription
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
@@ -28,21 +31,29 @@ NETWORK = FlowTransport.NETWORK
 CORPUS = Path(__file__).parents[2] / "corpus" / "valid"
 
 
-def groups(*needs: FlowNeed, **rest: object) -> list[ParticipantGroup]:
+def planned(only: Node, **rest: object) -> PlannedNode:
+    return build_plan(manifest(only, **rest), environment={}).nodes[0]
+
+
+def extra(*needs: FlowNeed) -> tuple[PlannedParticipant, ...]:
     """The participants of one node whose publishers have these needs."""
     only = node("n", *(publisher(each.name) for each in needs), needs=needs)
-    return list(FlowNeeds(manifest(only, **rest)).groups(only))
+    return planned(only).participants
 
 
-def carried(*needs: FlowNeed, **rest: object) -> list[tuple[str, ...]]:
-    return [each.names for each in groups(*needs, **rest)]
+def carried(*needs: FlowNeed) -> list[tuple[str, ...]]:
+    only = planned(node("n", *(publisher(each.name) for each in needs), needs=needs))
+    return [
+        tuple(end.name for end in only.endpoints if end.participant == each.name)
+        for each in only.participants
+    ]
 
 
 # --- as few participants as meet every need
 
 
 def test_publishers_that_ask_for_nothing_stay_in_the_node_s_own_participant():
-    assert groups(need(PUB, "a"), need(PUB, "b", UniqueRequirement.SYSTEM_DEFAULT)) == []
+    assert extra(need(PUB, "a"), need(PUB, "b", UniqueRequirement.SYSTEM_DEFAULT)) == ()
 
 
 def test_publishers_of_one_class_share_and_of_two_classes_do_not():
@@ -65,11 +76,11 @@ def test_a_unique_publisher_shares_with_none_even_of_its_class(unique: UniqueReq
 
 
 def test_the_smaller_datagram_serves_all_of_a_class():
-    (only,) = groups(
+    (only,) = extra(
         need(PUB, "small", dscp=46, max_message_size=100),
         need(PUB, "large", dscp=46, max_message_size=60_000),
     )
-    assert (only.names, only.max_datagram_bytes) == (("small", "large"), 1400)
+    assert only.max_datagram_bytes == 1400
 
 
 @pytest.mark.parametrize(
@@ -108,9 +119,10 @@ def test_a_node_whose_own_participant_is_on_the_network_needs_no_other_for_it():
             need(SUB, "b", transport=NETWORK),
         ],
     )
-    needs = FlowNeeds(manifest(only))
-    assert needs.node_transports(only) == ("udpv4",)
-    assert [(each.names, each.transports) for each in needs.groups(only)] == [(("c",), ("udpv4",))]
+    found = planned(only)
+    assert found.transports == ("udpv4",)
+    assert [each.transports for each in found.participants] == [("udpv4",)]
+    assert [each.name for each in found.endpoints if each.participant] == ["c"]
 
 
 def test_publishers_of_one_5qi_share_and_of_two_do_not():
@@ -146,24 +158,24 @@ def test_a_prioritised_publisher_gets_datagrams_that_ip_leaves_whole(
         needs=[need(PUB, "a", dscp=46, max_message_size=size)],
         machine="m",
     )
-    system = manifest(
+    found = planned(
         only,
         machines=(Machine(name="m", address=address, at=at(1)),),
         network=Network(max_datagram_bytes=declared),
     )
-    assert [each.max_datagram_bytes for each in FlowNeeds(system).groups(only)] == [limit]
+    assert [each.max_datagram_bytes for each in found.participants] == [limit]
 
 
 @pytest.mark.parametrize(
     "asks", [{"dscp": 46}, {"five_qi": 9}, {"unique": STRICTLY}, {"unique": OPTIONALLY}]
 )
 def test_prioritised_is_what_is_marked_has_a_class_or_is_unique(asks: dict[str, object]):
-    (only,) = groups(need(PUB, "a", max_message_size=9000, **asks))
+    (only,) = extra(need(PUB, "a", max_message_size=9000, **asks))
     assert only.max_datagram_bytes == 1400
 
 
 def test_a_flow_that_no_network_is_to_prefer_may_be_fragmented():
-    assert groups(need(PUB, "a", max_message_size=9000)) == []
+    assert extra(need(PUB, "a", max_message_size=9000)) == ()
 
 
 def test_network_transport_is_ipv6_where_the_machine_s_address_is():
@@ -173,8 +185,8 @@ def test_network_transport_is_ipv6_where_the_machine_s_address_is():
         ("", ("udpv4",)),
     ):
         only = node("n", publisher("a"), needs=[need(PUB, "a", transport=NETWORK)], machine="m")
-        system = manifest(only, machines=(Machine(name="m", address=address, at=at(1)),))
-        assert [each.transports for each in FlowNeeds(system).groups(only)] == [transports]
+        found = planned(only, machines=(Machine(name="m", address=address, at=at(1)),))
+        assert [each.transports for each in found.participants] == [transports]
 
 
 # --- 5QI
@@ -189,7 +201,7 @@ def test_auto_takes_the_shortest_delay_of_the_links_of_its_topic():
     links = [link("/a", "n", "x", max_delay_ms=300.0), link("/a", "n", "y", max_delay_ms=100.0)]
     each = resolved(need(PUB, "a", five_qi_auto=True), *links)
     assert each.max_delay_ms == 100.0
-    assert "delay budget 100 ms <= 100 ms" in each.flow_class.reason
+    assert "keeps max_delay_ms 100" in each.flow_class.reason
 
 
 def test_a_declared_rate_asks_for_a_class_that_guarantees_one():
@@ -206,7 +218,7 @@ def test_without_a_rate_a_class_that_guarantees_one_is_the_last_resort():
 def test_a_written_5qi_is_kept_with_what_it_does_not_keep():
     each = resolved(need(PUB, "a", five_qi=3, max_delay_ms=5.0, loss=1e-6))
     assert each.five_qi == 3
-    assert [issue.field for issue in each.flow_class.issues] == ["max_delay_ms", "loss"]
+    assert [field for field, _ in each.flow_class.issues] == ["max_delay_ms", "loss"]
 
 
 # --- through the loader
@@ -229,19 +241,3 @@ def test_every_key_of_flow_needs_becomes_its_field(monkeypatch: pytest.MonkeyPat
     assert (alarm.five_qi, alarm.five_qi_auto, alarm.dscp) == (82, False, None)
     assert (log.dscp, log.transport, log.non_blocking_send) == (8, FlowTransport.ANY, False)
     assert system.nodes[1].flows[0].transport is NETWORK
-
-
-def test_an_included_manifest_does_not_bring_its_network(findings):
-    part = """\
-    manifest_version: 1
-    system: part
-    network: {max_datagram_bytes: 1300}
-    nodes: {n: {run: {python: "demo:N"}}}
-    """
-    found = findings("include: [{manifest: part.yaml}]\n", part_yaml=part)
-    assert [each for each in found if each.startswith("manifest.include-ignored")] == [
-        (
-            "manifest.include-ignored part.yaml:3:1: note: network: cannot use the "
-            "network of an included manifest; the including one's holds"
-        )
-    ]

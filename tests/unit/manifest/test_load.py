@@ -137,7 +137,7 @@ def test_ways_to_run(every_key: Manifest) -> None:
     assert _node(every_key, "talker").run == Run(
         kind=RunKind.PYTHON,
         python="demo.nodes:Talker",
-        environment=(("LANG", "C"), ("LEVEL", "3"), ("VERSION", "1.10")),
+        environment={"LANG": "C", "LEVEL": "3", "VERSION": "1.10"},
         working_directory=str(VALID),
         no_new_privileges=True,
         limits=Limits(as_mib=4096, cpu_sec=3600, nofile=1024, nproc=4096),
@@ -330,7 +330,7 @@ def test_substitutions_take_the_type_that_the_place_needs(monkeypatch: pytest.Mo
     assert camera.namespace == "/r2/left"
     assert not camera.managed
     assert camera.run.command == ("sh", "-c", "exec camera --left $(date)")
-    assert camera.run.environment == (("SIDE", "left"), ("EMPTY", ""))
+    assert camera.run.environment == {"SIDE": "left", "EMPTY": ""}
     assert dict(camera.parameters) == {
         "number": 42,
         "text": "42",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.loading import load
-from lifecycle.manifest.schema import read_schema
+from lifecycle.manifest.written import read_schema
 from lifecycle.manifest.yaml.source import compose
 
 SLOW = settings(

@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 from lifecycle.manifest import written
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import PRESETS
-from lifecycle.manifest.schema import MANIFEST, read_schema, validate, validator
+from lifecycle.manifest.schema import validate, validator
+from lifecycle.manifest.written import MANIFEST, read_schema
 from lifecycle.manifest.yaml.source import parse
 
 ROOT = Path(__file__).parents[3]

@@ -8,35 +8,36 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.checks import check
-from lifecycle.manifest.model import Condition, Manifest
-from tests.builders import manifest, node
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.model import Condition
+from lifecycle.plan.build import dependency_levels
+from tests.builders import node
 
 Findings = Callable[..., list[str]]
 
 
-def system(edges: dict[str, list[str]]) -> Manifest:
-    return manifest(
-        *(
-            node(key, after=[(other, Condition.STARTED) for other in others])
-            for key, others in edges.items()
-        )
-    )
-
-
-def circles(edges: dict[str, list[str]]) -> list[str]:
-    found = check(system(edges), environment={})
-    return [each.message.rpartition(": ")[2] for each in found if each.rule == "check.after-cycle"]
+def circle(edges: dict[str, list[str]]) -> str:
+    nodes = [
+        node(key, after=[(other, Condition.STARTED) for other in others])
+        for key, others in edges.items()
+    ]
+    try:
+        dependency_levels(nodes)
+    except ManifestError as problem:
+        (found,) = problem.diagnostics
+        return found.message.rpartition(": ")[2]
+    return ""
 
 
 def test_a_circle_is_shown_without_the_way_that_leads_to_it() -> None:
-    assert circles({"in": ["a"], "a": ["b"], "b": ["a"]}) == ["a → b → a"]
+    found = circle({"in": ["a"], "a": ["b"], "b": ["a"]})
+    assert found in ("a → b → a", "b → a → b")
 
 
 def test_a_chain_of_ten_thousand_nodes_is_no_problem() -> None:
     edges = {f"n{i}": [f"n{i + 1}"] for i in range(10_000)}
     edges["n10000"] = ["n0"]
-    assert len(circles(edges)) == 1
+    assert circle(edges)
 
 
 keys = st.sampled_from("abcdef")
@@ -49,7 +50,7 @@ def test_a_circle_is_found_exactly_when_no_order_exists(edges: dict[str, list[st
     while ready := [key for key, others in left.items() if not set(others) & set(left)]:
         for key in ready:
             del left[key]
-    assert bool(circles(known)) == bool(left)
+    assert bool(circle(known)) == bool(left)
 
 
 @pytest.mark.parametrize(

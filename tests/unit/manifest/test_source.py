@@ -102,16 +102,6 @@ def test_a_name_that_is_no_utf8_does_not_reach_messages(tmp_path: Path) -> None:
     assert str(caught.value).encode("utf-8").startswith(os.fsencode(tmp_path) + b"/caf")
 
 
-def test_another_suffix_is_noted(tmp_path: Path) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text(GOOD, encoding="utf-8")
-    (only,) = load(path).warnings
-    assert str(only) == (
-        f"{path}:1:1: note: cannot tell by its name 'robot.yaml' that this is a manifest; "
-        "rename it to robot.lifecycle.yaml"
-    )
-
-
 # Each of these is one million characters; libyaml's and our own cost must stay linear.
 _N = 1_000_000
 BOMBS = {

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.network.five_qi import ResourceType, check_class, five_qi_of, five_qis, propose
+from lifecycle.network.five_qi import (
+    Needs,
+    ResourceType,
+    check_class,
+    five_qi_of,
+    five_qis,
+    propose,
+)
 
 GBR, NON_GBR = ResourceType.GBR, ResourceType.NON_GBR
 DELAY_CRITICAL = ResourceType.DELAY_CRITICAL_GBR
@@ -86,25 +93,26 @@ def test_an_unknown_value_is_refused_with_what_there_is() -> None:
         (82, {"loss": 1e-5}, ("loss",)),
         (2, {"rate_bps": 2e6}, ()),
         (9, {"rate_bps": 2e6}, ("rate_bps",)),
-        (85, {"rate_bps": 408_000, "message_bytes": 255}, ()),
-        (85, {"rate_bps": 1e6, "message_bytes": 20_000}, ("rate_bps", "message_bytes")),
+        (85, {"rate_bps": 408_000, "max_message_size": 255}, ()),
+        (85, {"rate_bps": 1e6, "max_message_size": 20_000}, ("rate_bps", "max_message_size")),
     ],
 )
 def test_each_need_that_a_class_does_not_keep_is_an_issue(
     value: int, needs: dict[str, float], fields: tuple[str, ...]
 ) -> None:
-    found = check_class(five_qi_of(value), **needs)  # type: ignore[arg-type]
-    assert tuple(each.field for each in found) == fields
-    assert all(f"with 5QI {value} (" in each.message for each in found)
+    found = [*check_class(five_qi_of(value), Needs(**needs))]  # type: ignore[arg-type]
+    assert tuple(field for field, _ in found) == fields
+    assert all(f"with 5QI {value} (" in message for _, message in found)
 
 
 def test_an_issue_names_what_is_asked_for_and_what_the_class_has() -> None:
-    rate, message = check_class(five_qi_of(85), rate_bps=1e6, message_bytes=20_000)
-    assert rate.message == (
+    needs = Needs(rate_bps=1e6, max_message_size=20_000)
+    (_, rate), (_, message) = check_class(five_qi_of(85), needs)
+    assert rate == (
         "cannot keep the delay of 1e+06 bit/s with 5QI 85 (Delay-critical GBR): by default it "
         "serves 255 bytes in 5 ms, 408000 bit/s"
     )
-    assert "20000 bytes" in message.message
+    assert "20000 bytes" in message
 
 
 @pytest.mark.parametrize(
@@ -125,35 +133,38 @@ def test_an_issue_names_what_is_asked_for_and_what_the_class_has() -> None:
 def test_the_least_demanding_class_that_fits_is_proposed(
     max_delay_ms: float, loss: float, *, gbr: bool | None, value: int
 ) -> None:
-    found = propose(max_delay_ms, loss, gbr).five_qi
+    found, _ = propose(Needs(max_delay_ms=max_delay_ms, loss=loss), gbr)
     assert found is not None
     assert found.value == value
 
 
 def test_a_proposal_says_why() -> None:
-    assert propose(10, 1e-3, True).why == (
-        "5QI 82 (Delay-critical GBR): delay budget 10 ms <= 10 ms, error rate 0.0001 <= 0.001; "
-        "the least demanding class of Release 16 that fits"
+    _, why = propose(Needs(max_delay_ms=10, loss=1e-3), True)
+    assert why == (
+        "5QI 82 (Delay-critical GBR): delay budget 10 ms, error rate 0.0001; the least demanding "
+        "class of Release 16 that keeps max_delay_ms 10, loss 0.001"
     )
 
 
 def test_a_later_release_is_proposed_where_release_16_has_nothing() -> None:
-    proposal = propose(20, 1e-3, True, message_bytes=20_000)
-    assert proposal.five_qi is five_qi_of(90)
-    assert "the least demanding class of Release 17 that fits" in proposal.why
+    found, why = propose(Needs(max_delay_ms=20, loss=1e-3, max_message_size=20_000), True)
+    assert found is five_qi_of(90)
+    assert "the least demanding class of Release 17" in why
 
 
 def test_classes_with_a_doubtful_cell_are_not_proposed() -> None:
-    assert propose(50, 1e-2, False).five_qi is five_qi_of(80)  # and not 79
+    found, _ = propose(Needs(max_delay_ms=50, loss=1e-2), False)
+    assert found is five_qi_of(80)  # and not 79
 
 
 def test_where_nothing_fits_all_that_was_asked_for_is_named() -> None:
-    assert propose(1, 1e-3, True).why == (
-        "cannot propose a 5QI: no class keeps a delay of 1 ms, a loss of 0.001"
-    )
-    assert propose(5, 1e-5, True, message_bytes=256, rate_bps=1e6).why == (
-        "cannot propose a 5QI: no class keeps a delay of 5 ms, a loss of 1e-05, messages of 256 "
-        "bytes, 1e+06 bit/s"
+    needs = Needs(max_delay_ms=5, loss=1e-5, max_message_size=256, rate_bps=1e6)
+    assert propose(needs, True) == (
+        None,
+        (
+            "cannot propose a 5QI: no class keeps max_delay_ms 5, loss 1e-05, rate_bps 1e+06, "
+            "max_message_size 256"
+        ),
     )
 
 
@@ -161,13 +172,14 @@ def test_where_nothing_fits_all_that_was_asked_for_is_named() -> None:
     max_delay_ms=st.floats(0.1, 2000),
     exponent=st.floats(-9, 0),
     gbr=st.sampled_from((True, False, None)),
-    message_bytes=st.none() | st.integers(1, 70_000),
+    max_message_size=st.none() | st.integers(1, 70_000),
 )
 def test_a_proposed_class_keeps_what_was_asked_and_a_refusal_means_that_none_does(
-    max_delay_ms: float, exponent: float, *, gbr: bool | None, message_bytes: int | None
+    max_delay_ms: float, exponent: float, *, gbr: bool | None, max_message_size: int | None
 ) -> None:
     loss = 10.0**exponent
-    found = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes).five_qi
+    needs = Needs(max_delay_ms=max_delay_ms, loss=loss, max_message_size=max_message_size)
+    found, _ = propose(needs, gbr)
     keeping = [
         each
         for each in ALL
@@ -176,9 +188,9 @@ def test_a_proposed_class_keeps_what_was_asked_and_a_refusal_means_that_none_doe
         and each.packet_delay_budget_ms <= max_delay_ms
         and each.packet_error_rate <= loss
         and (
-            message_bytes is None
+            max_message_size is None
             or each.max_data_burst_bytes is None
-            or message_bytes <= each.max_data_burst_bytes
+            or max_message_size <= each.max_data_burst_bytes
         )
     ]
     assert (found is None) == (not keeping)

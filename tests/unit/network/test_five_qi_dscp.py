@@ -45,7 +45,7 @@ def test_a_user_writes_his_own_with_names_or_numbers() -> None:
     ("values", "reason"),
     [
         ('{"81": 46}', "cannot use 5QI 81; standardized are 1, 2, "),
-        ('{"85": 184}', "cannot use DSCP 184; use 0 to 63 or a name such as EF; 184 is a TOS byte"),
+        ('{"85": 184}', "cannot use 184 as DSCP; use 0 to 63 or one of DF"),
         ('{"85": "EFF"}', "cannot use 'EFF' as DSCP; "),
         ("[]", "Expected `object`, got `array` - at `$.values`"),
     ],

@@ -17,6 +17,7 @@ from lifecycle.network.ports import (
     EphemeralRange,
     ParticipantPorts,
     PortUse,
+    describe_domains,
     domain_base,
     domain_of,
     max_participants,
@@ -258,3 +259,11 @@ def test_one_multicast_port_among_the_ephemeral_ports_is_enough(offset: int) -> 
     assert capacity.participants == 0
     beside = domain_base(3) - 1
     assert max_participants(3, EphemeralRange(first=beside, last=beside)).participants == 120
+
+
+@pytest.mark.parametrize(
+    ("runs", "text"),
+    [((), "none"), ((range(3, 4),), "3"), ((range(102), range(215, 233)), "0–101, 215–232")],
+)
+def test_runs_of_domains_are_read_by_people(runs: tuple[range, ...], text: str) -> None:
+    assert describe_domains(runs) == text

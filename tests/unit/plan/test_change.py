@@ -57,7 +57,7 @@ def test_nodes_of_one_manifest_alone_come_and_go_and_all_else_stays() -> None:
     "changes",
     [
         {"run": Run(kind=RunKind.PYTHON, python="robot:Other")},
-        {"run": replace(TALKER.run, environment=(("RATE", "1"),))},
+        {"run": replace(TALKER.run, environment={"RATE": "1"})},
         {"run": COMMAND},
         {"run": ATTACH},
         {"remap": (("chatter", "noise"),)},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.model import (
     Authority,
     DataLayer,
@@ -19,7 +20,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.media import terms_of
-from lifecycle.plan.model import Plan, PlanError
+from lifecycle.plan.model import Plan
 from tests.builders import at, link, manifest, node, planned, publisher, subscription
 
 TWO = (
@@ -187,14 +188,15 @@ def test_what_node_configurations_decide_is_left_open():
 def test_a_pair_that_cannot_be_connected_is_refused_where_its_link_stands():
     foreign = Run(kind=RunKind.COMMAND, command=("n",))
     wish: Link = link("/t", "talker", "listener", transport=FlowTransport.TCPV4)
-    with pytest.raises(PlanError) as error:
+    with pytest.raises(ManifestError) as error:
         planned(
             node("talker", publisher("t"), run=foreign),
             node("listener", subscription("t")),
             links=[wish],
         )
-    assert error.value.at == wish.at
-    assert error.value.message == (
+    (found,) = error.value.diagnostics
+    assert found.at == wish.at
+    assert found.message == (
         "cannot carry '/t' from 'talker' to 'listener' by tcpv4, as a link says so: 'talker' can "
         "be connected by shm, udpv4; 'listener' by shm, udpv4, udpv6, udpm, tcpv4"
     )

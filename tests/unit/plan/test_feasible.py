@@ -30,7 +30,7 @@ def said(system: Manifest) -> list[str]:
 
 def test_every_pair_that_cannot_be_connected_is_said_at_its_publisher():
     by = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv6"}
-    foreign = Run(kind=RunKind.COMMAND, command=("viewer",), environment=tuple(by.items()))
+    foreign = Run(kind=RunKind.COMMAND, command=("viewer",), environment=by)
     system = manifest(
         node(
             "camera",

@@ -235,7 +235,7 @@ def test_secrets_of_the_environment_are_in_nothing_that_is_shown_or_written(
     old, new = made("old", "hunter2", "low"), made("new", "hunter3", "high")
     assert dict(old.node("talker").run.environment)["CAMERA_TOKEN"] == "hunter2"
     kept = without_secrets(old)
-    redacted = (("LEVEL", "low"), ("CAMERA_TOKEN", "(redacted)"), ("AUTHOR", "me"))
+    redacted = {"LEVEL": "low", "CAMERA_TOKEN": "(redacted)", "AUTHOR": "me"}
     assert kept.node("talker").run.environment == redacted
     assert "hunter" not in repr(kept)
     assert without_secrets(kept) == kept

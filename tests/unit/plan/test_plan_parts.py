@@ -104,7 +104,7 @@ def test_a_process_is_named_by_its_node_or_as_declared():
 
 
 def test_a_process_is_told_its_domain_its_range_and_its_nodes_variables():
-    run = Run(kind=RunKind.PYTHON, python="m:C", environment=(("A", "1"), ("ROS_DOMAIN_ID", "9")))
+    run = Run(kind=RunKind.PYTHON, python="m:C", environment={"A": "1", "ROS_DOMAIN_ID": "9"})
     (found,) = processes(node("a", run=run))
     assert found.environment == (
         ("ROS_DOMAIN_ID", "9"),

@@ -253,7 +253,7 @@ def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
     (folder / "bin" / "listen").write_text("#!/bin/sh\n")
     (folder / "bin" / "talk").chmod(0o755)
     path = {"PATH": "/nowhere"}
-    own = (("PATH", f"{folder}/bin"),)
+    own = {"PATH": f"{folder}/bin"}
     run = Run(kind=RunKind.COMMAND, command=("talk",), environment=own)
     assert resolve_programs(manifest(node("t", run=run)), environment=path) == Resolution()
     assert command("bin/talk") == Resolution()
@@ -334,7 +334,7 @@ def test_a_class_of_others_is_managed_as_it_can_be(
     folder: Path, name: str, managed: bool, arguments: dict[str, str], message: str
 ) -> None:
     write(folder, them=FOREIGN)
-    run = Run(kind=RunKind.PYTHON, python=f"them:{name}", arguments=tuple(arguments.items()))
+    run = Run(kind=RunKind.PYTHON, python=f"them:{name}", arguments=arguments)
     found = resolve_programs(manifest(node("talker", run=run, managed=managed)), environment={})
     assert said(found) == ([message] if message else [])
 
@@ -342,7 +342,7 @@ def test_a_class_of_others_is_managed_as_it_can_be(
 def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -> None:
     (folder / "src").mkdir()
     write(folder / "src", them=FOREIGN)
-    environment = (("PYTHONPATH", str(folder / "src")),)
+    environment = {"PYTHONPATH": str(folder / "src")}
     run = Run(kind=RunKind.PYTHON, python="them:Managed")
     assert said(resolve_programs(manifest(node("talker", run=run)), environment={})) != []
     given = replace(run, environment=environment)

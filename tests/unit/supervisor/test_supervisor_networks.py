@@ -18,6 +18,7 @@ from lifecycle.programming.programmer import open_programmer
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
+    Program,
     ProgrammingError,
     TargetChanges,
     read_targets,
@@ -184,13 +185,14 @@ class Applied:
     def __init__(self, directory: Path, server: NefServer) -> None:
         self.server = server
         settings = nef_settings(server.url, devices=["10.77.0.1"])
-        self.options = read_targets(["nef"], {"config": settings_file(directory, nef=settings)})[0]
+        given = {"config": settings_file(directory, nef=settings)}
+        self.options = Program(read_targets(["nef"], given))
         self.root = directory / "lifecycle"
         self.environment = {"XDG_RUNTIME_DIR": str(directory)}
 
     def apply(self, *, owned: bool = False) -> Path:
         programmer = open_programmer(
-            plan(), [self.options], environment=self.environment, owned=owned
+            plan(), self.options, environment=self.environment, owned=owned
         )
         asyncio.run(programmer.update([report()]))
         return self.root / run_name(plan())
@@ -240,7 +242,7 @@ def test_before_it_programs_a_run_removes_what_dead_runs_left_even_its_own(
     ledger.write_text(ledger.read_text().replace(f'"pid":{os.getpid()}', '"pid":1'))
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:
-        for options, left in ((UpOptions(), 1), (UpOptions(program=(applied.options,)), 0)):
+        for options, left in ((UpOptions(), 1), (UpOptions(program=applied.options), 0)):
             open_networks(plan(), options, directory, notices.emit, environment=applied.environment)
             assert len(applied.server.subscriptions) == left
     finally:
