@@ -14,6 +14,7 @@ from lifecycle.manifest.model import TargetState
 from lifecycle.plan.comparison import PlanChange, change_between, difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
+from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
     Change,
@@ -33,6 +34,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
 )
 from lifecycle.supervisor.run.options import Until
+from lifecycle.verify.judge import not_ok
 
 # Modes
 
@@ -238,9 +240,10 @@ def undone(run: Run, change: Change) -> str:
     how = f"{now} and verified"
     if change.again:
         how = f"and what failed meanwhile is started again as its policy says: {change.again}"
-    elif change.state:
+    elif (verdict := run.judged.verdict) is not None and not gate.allows(run):
         resume = "" if now == "active" else ": lifecycle resume"
-        how = f"but {change.state}; it is {now}{resume}"
+        found = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
+        how = f"but {found}; it is {now}{resume}"
     elif now == "held":
         how = "verified, and held as before: lifecycle resume"
     return f"{text}{before} is in force again, revision {run.revision}, {how}"

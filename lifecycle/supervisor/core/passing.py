@@ -217,9 +217,7 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
     for key in (*keys, *sent):
         # With what is started again by its policy these pass, too.
         run.nodes[key].refused = change is None or not change.again
-    if change is not None:
-        change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
-    else:
+    if change is None:
         run.answer(code, text)
     return said
 
@@ -230,7 +228,6 @@ def _became_another(run: Run) -> list[Event]:
     assert passage is not None
     if run.change is not None:
         run.passage = None
-        run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
         return [Notice(message=gate.refusal(verdict))]
     if passage.asked:
         run.answer(gate.exit_code(verdict), gate.refusal(verdict))

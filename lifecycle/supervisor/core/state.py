@@ -390,7 +390,6 @@ class Change(msgspec.Struct, kw_only=True):
         given: what nodes were asked to take; who did not answer may have taken it.
         taken: the manifest is in force.
         back: the system goes back to the manifest before.
-        state: why the gate stayed closed for the manifest before; empty if it did not.
         again: what failed meanwhile, and is started again by its policy; empty if nothing.
     """
 
@@ -409,7 +408,6 @@ class Change(msgspec.Struct, kw_only=True):
     back: bool = False
     reason: str = ""
     code: ExitCode = ExitCode.OK
-    state: str = ""
     again: str = ""
 
 

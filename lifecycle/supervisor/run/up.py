@@ -52,7 +52,6 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
-from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.control.status import ended_early
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
@@ -332,7 +331,6 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
             wait for ever.
     """
     check_log_root(os.environ)
-    check_installed(plan.policy)
     # What was loaded stays. To look through all of it whenever garbage is collected takes 40 ms,
     # and once more at the very end, when who asked for the end waits for nothing else.
     gc.freeze()
