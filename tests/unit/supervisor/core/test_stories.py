@@ -23,10 +23,7 @@ from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, new_run
-from lifecycle.supervisor.run.events import (
-    Failure,
-    VerdictChanged,
-)
+from lifecycle.supervisor.run.events import Failure, SystemReached, VerdictChanged
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
@@ -268,6 +265,15 @@ def test_one_node_is_restarted_through_the_gate_and_waits_for_an_order_if_that_s
     assert play.see() == []
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+def test_a_plain_process_that_was_restarted_passes_the_gate_and_its_ports_are_programmed() -> None:
+    plain = planned_node("driver", managed=False, kind=RunKind.COMMAND, supervision=AGAIN)
+    play = Play(plan_of(plain, planned_node("viewer")))
+    play.die("driver")
+    assert play.wait(5.0) == ["spawn driver", "driver start", "program"]
+    said = [each.reached for each in play.events if isinstance(each, SystemReached)]
+    assert said == ["connected", *2 * ["verified", "active"]]
 
 
 def test_a_gate_stays_closed_for_good_only_by_a_verdict_of_what_is_there_now() -> None:
