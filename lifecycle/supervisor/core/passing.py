@@ -66,7 +66,7 @@ def _wait_again(run: Run) -> None:
     if run.asked is not None:
         return
     busy = run.switch is not None or run.change is not None or run.held_s is None
-    # A plain node waits for no gate: what it brought along is verified, and programmed, all the same.
+    # A plain node waits for no gate: what it brought along is verified, and programmed, too.
     back = any(each.away_s is not None and not each.failed for each in run.processes.values())
     if busy or not (advance.waiting(run) or back) or not advance.is_at_gate(run):
         run.passage = None
