@@ -130,8 +130,10 @@ async def test_a_node_in_which_a_step_fails_has_everything_rolled_back(
 
 @pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
 async def test_a_start_that_hangs_is_noticed_and_time_without_a_processor_does_not_count(
-    tmp_path: Path, starves: float, after_s: float
+    tmp_path: Path, starves: float, after_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    ours = "lifecycle.supervisor.nodes.system.run_delay_s"  # which is real, where time jumps
+    monkeypatch.setattr(ours, lambda: 0.0)
     world = world_of(tmp_path, planned_node("a", timeouts=Timeouts(start_s=2.0)))
     world.hosts.ways["a start"] = "hang"
     world.hosts.starves["a"] = starves  # as many of its threads, all the time
