@@ -23,7 +23,12 @@ from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, new_run
-from lifecycle.supervisor.run.events import Failure, SystemReached, VerdictChanged
+from lifecycle.supervisor.run.events import (
+    ConsequenceTaken,
+    Failure,
+    SystemReached,
+    VerdictChanged,
+)
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
@@ -394,6 +399,19 @@ def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resume
     assert play.levels == "4 3"
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+def test_a_node_that_others_activate_again_for_ever_has_its_consequence_once() -> None:
+    reaction = Reaction(rule="param", what=Consequence.DEACTIVATE)
+    play = Play(
+        replace(plan_of(planned_node("base", kind=RunKind.ATTACH)), on_violation=(reaction,))
+    )
+    play.see(("param.value-differs", "/base"))
+    assert play.wait(1.0) == ["base deactivate"]
+    for _ in range(6):
+        play.give(messages.Saw(levels={"base": Level.ACTIVE}))
+    play.wait(2.0)
+    assert (play.levels, len(play.heard(ConsequenceTaken))) == ("4", 1)
 
 
 @pytest.mark.parametrize("what", [Consequence.PAUSE, Consequence.DEACTIVATE])
