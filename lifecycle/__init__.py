@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lifecycle.public import public_name
-
 if TYPE_CHECKING:
     from lifecycle.node.handlers import on_action, on_goal, on_message, on_service, on_timer
     from lifecycle.node.host.standalone import run
@@ -29,26 +27,18 @@ __all__ = [
     "run",
 ]
 
-
-_PUBLIC: dict[str, tuple[str, ...]] = {
-    "lifecycle.node.handlers": (
-        "on_action",
-        "on_goal",
-        "on_message",
-        "on_service",
-        "on_timer",
-    ),
-    "lifecycle.node.node": (
-        "ERROR",
-        "FAILURE",
-        "LifecycleNode",
-        "SUCCESS",
-        "TransitionCallbackReturn",
-    ),
-    "lifecycle.node.host.standalone": ("run",),
+_NODE = ("ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn")
+_HOME = {
+    **dict.fromkeys(_NODE, "node"),
+    "run": "host.standalone",
 }
+"""Module of `lifecycle.node` that has a name; of others `handlers`."""
 
 
 def __getattr__(name: str) -> object:
     """Load the module of a public name on first use (PEP 562)."""
-    return public_name(__name__, _PUBLIC, name)
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(f"lifecycle.node.{_HOME.get(name, 'handlers')}"), name)

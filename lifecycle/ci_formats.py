@@ -27,7 +27,6 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         at: `file:line:column` that it is about; empty for none.
         failure: (message, text); None if it passes.
         note: text beside its result; empty for none.
-        skipped: why it was not judged; empty if it was.
     """
 
     classname: str
@@ -35,46 +34,26 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     at: str = ""
     failure: tuple[str, str] | None = None
     note: str = ""
-    skipped: str = ""
 
 
-class Suite(msgspec.Struct, frozen=True, kw_only=True):
-    """Test cases under one name, and text that is of all of them."""
-
-    name: str
-    cases: Sequence[Case]
-    note: str = ""
-
-
-def junit(suites: Iterable[Suite], *, name: str = "") -> str:
-    """Return JUnit XML.
-
-    Args:
-        suites: in their order.
-        name: of the whole; empty for none.
-    """
-    root = ET.Element("testsuites", {"name": lines(name)} if name else {})
-    every: list[Case] = []
-    for suite in suites:
-        element = ET.SubElement(root, "testsuite", name=lines(suite.name))
-        for case in suite.cases:
-            one = ET.SubElement(
-                element, "testcase", classname=case.classname, name=lines(case.name)
-            )
-            if case.at:
-                file, line, _ = _place(case.at)
-                one.set("file", lines(file))
-                one.set("line", line)
-            if case.failure is not None:
-                message, text = map(lines, case.failure)
-                ET.SubElement(one, "failure", message=message).text = text
-            _note(one, case.note)
-            if case.skipped:
-                ET.SubElement(one, "skipped", message=case.skipped)
-        _note(element, suite.note)
-        _count(element, suite.cases)
-        every += suite.cases
-    _count(root, every)
+def junit(name: str, cases: Sequence[Case], *, note: str = "") -> str:
+    """Return JUnit XML of one suite, with text that is of all of its cases."""
+    root = ET.Element("testsuites")
+    suite = ET.SubElement(root, "testsuite", name=lines(name))
+    failures = sum(each.failure is not None for each in cases)
+    for element in (root, suite):
+        element.attrib |= {"tests": str(len(cases)), "failures": str(failures)}
+    for case in cases:
+        names = {"classname": lines(case.classname), "name": lines(case.name)}
+        one = ET.SubElement(suite, "testcase", names)
+        if case.at:
+            file, line, _ = _place(case.at)
+            one.attrib |= {"file": lines(file), "line": line}
+        if case.failure is not None:
+            message, text = map(lines, case.failure)
+            ET.SubElement(one, "failure", message=message).text = text
+        _note(one, case.note)
+    _note(suite, note)
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
@@ -82,12 +61,6 @@ def junit(suites: Iterable[Suite], *, name: str = "") -> str:
 def _note(place: ET.Element, text: str) -> None:
     if text:
         ET.SubElement(place, "system-out").text = lines(text)
-
-
-def _count(element: ET.Element, cases: Sequence[Case]) -> None:
-    element.set("tests", str(len(cases)))
-    element.set("failures", str(sum(each.failure is not None for each in cases)))
-    element.set("skipped", str(sum(bool(each.skipped) for each in cases)))
 
 
 class Problem(msgspec.Struct, frozen=True, kw_only=True):

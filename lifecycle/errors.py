@@ -6,7 +6,6 @@ boundary (`lifecycle.cli.main`) turns exceptions into exit codes. Imports nothin
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import errno
 import os
@@ -76,52 +75,23 @@ class ExhaustedError(LifecycleError):
     exit_code = ExitCode.BRING_UP_FAILED
 
 
-_EXHAUSTED = (
-    (errno.EMFILE, "file descriptors", "RLIMIT_NOFILE", "raise it (ulimit -n, LimitNOFILE=)"),
-    (errno.ENFILE, "file descriptors of the machine", "", "raise fs.file-max (sysctl)"),
-    (errno.ENOMEM, "memory", "RLIMIT_AS", "raise it (ulimit -v, LimitAS=), or end other programs"),
-    (errno.ENOSPC, "room on a disk", "", "make room there (df)"),
-    (errno.EDQUOT, "room on a disk: its quota is reached", "", "make room there (quota)"),
-    (errno.EFBIG, "room in a file", "RLIMIT_FSIZE", "raise it (ulimit -f, LimitFSIZE=)"),
+_USED_UP = (
+    *map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC)),
+    *map(os.strerror, (errno.EDQUOT, errno.EFBIG)),
+    *("can't start new thread", "failed to map segment", "bad_alloc"),
 )
-_OF_MEMORY = ("failed to map segment", "bad_alloc")
-_OF_THREADS = "can't start new thread"
+"""What says, also in what a library said, that a resource is used up."""
 
 
 def exhausted(error: BaseException) -> ExhaustedError | None:
-    """Return what an exception says where it only means that there is no more of a resource.
-
-    Args:
-        error: any exception, also one whose text quotes what a library said.
-    """
-    text = str(error)
-    number = error.errno if isinstance(error, OSError) else None
-    if isinstance(error, MemoryError) or any(each in text for each in _OF_MEMORY):
-        number = errno.ENOMEM
-    if _OF_THREADS in text:
-        return ExhaustedError(
-            f"cannot go on without more threads, or memory for them{_limit('RLIMIT_AS')}: {text}",
-            hint="raise the limit (ulimit -u, TasksMax= or pids.max; ulimit -v)",
-        )
-    for known, what, limit, hint in _EXHAUSTED:
-        if number != known and os.strerror(known) not in text:
-            continue
-        said = " ".join(text.split()) or type(error).__name__
-        return ExhaustedError(f"cannot go on without more {what}{_limit(limit)}: {said}", hint=hint)
-    return None
-
-
-def _limit(name: str) -> str:
-    """Return the value of a limit as getrlimit(2) has it; empty where there is none."""
-    if not name:
-        return ""
-    with contextlib.suppress(ImportError, AttributeError, OSError):
-        import resource  # only Unix has it
-
-        soft, _ = resource.getrlimit(getattr(resource, name))
-        if soft != resource.RLIM_INFINITY:
-            return f" ({name} allows {soft})"
-    return ""
+    """Return what an exception says where it only means that there is no more of a resource."""
+    said = " ".join(str(error).split()) or type(error).__name__
+    if not isinstance(error, MemoryError) and not any(each in said for each in _USED_UP):
+        return None
+    return ExhaustedError(
+        f"cannot go on, a resource is used up: {said}",
+        hint="raise its limit (ulimit -a; Limit…= and TasksMax= of systemd), or make room (df)",
+    )
 
 
 MAX_WORDS = 500

@@ -18,7 +18,6 @@ import sys
 import threading
 import time
 import warnings
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,21 +54,14 @@ class SystemFailedError(AssertionError):
 def claimed_domain() -> Iterator[int]:
     """Give a ROS domain that no other test of this machine has, for as long as the block lasts.
 
-    One in which processes run is the last choice: a test that was killed may have left them.
     `LIFECYCLE_TEST_DOMAINS=10-19` says which to choose from.
     """
     pool: Sequence[int] = DOMAINS
     if given := os.environ.get("LIFECYCLE_TEST_DOMAINS", ""):
         first, _, last = given.partition("-")
         pool = range(int(first), int(last or first) + 1)
-    used: Counter[str] = Counter()
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended, or is another user's
-            for each in (process / "environ").read_bytes().split(b"\0"):
-                if each.startswith(b"ROS_DOMAIN_ID="):
-                    used[each.partition(b"=")[2].decode(errors="replace")] += 1
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as claim:
-        for domain in sorted(pool, key=lambda each: used[str(each)]):
+        for domain in pool:
             try:
                 claim.bind(f"\0lifecycle-test-domain-{domain}")
             except OSError:

@@ -104,14 +104,7 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
     else:
         import tempfile
 
-        try:
-            temporary = tempfile.gettempdir()
-        except OSError as error:
-            raise UsageError(
-                "cannot find a directory for run directories: no temporary directory is writable",
-                hint="set XDG_RUNTIME_DIR to a directory of this user's own",
-            ) from error
-        root = Path(temporary) / f"lifecycle-{os.getuid()}"
+        root = Path(tempfile.gettempdir()) / f"lifecycle-{os.getuid()}"
     _refuse_unsafe_parents(root)
     if os.path.lexists(root):
         _refuse_unless_private(root)
@@ -414,29 +407,22 @@ FORK_SERVER = "zygote"
 def lost(path: Path) -> UsageError:
     """Return why a run has no answer: its supervisor was killed, with what still runs of it."""
     record = read_record(path)
+    pid = f" (pid {record.supervisor.pid})" if record is not None else ""
     if is_held(path):
-        pid = f" (pid {record.supervisor.pid})" if record is not None else ""
         return UsageError(
             f"cannot ask {path.name!r}: its supervisor{pid} is just starting or ending",
             hint="try again",
         )
-    pid, left = "", list[str]()
-    if record is not None:
-        pid = f" (pid {record.supervisor.pid})"
-        here = record.boot_id == boot_id()
-        left = [
-            f"{each.name} (pid {each.pid})"
-            for each in sorted(record.children, key=lambda child: child.name)
-            if here and each.name != FORK_SERVER and is_process(each.pid, each.start_ticks)
-        ]
-    count = "1 process still runs" if len(left) == 1 else f"{len(left)} processes still run"
-    still = f"{count}: {', '.join(left)}" if left else "none of its processes runs any more"
-    end = f"lifecycle down {path.name}"
+    here = record is not None and record.boot_id == boot_id()
+    left = sorted(
+        f"{each.name} (pid {each.pid})"
+        for each in (record.children if record is not None and here else ())
+        if each.name != FORK_SERVER and is_process(each.pid, each.start_ticks)
+    )
+    still = f"{', '.join(left)} still run" if left else "none of its processes runs any more"
     return UsageError(
         f"cannot ask {path.name!r}: its supervisor{pid} died; {still}",
-        hint=f"end them: {end}; the next lifecycle up does so, too"
-        if left
-        else f"clean up after it: {end}",
+        hint=f"end what is left of it: lifecycle down {path.name}; the next lifecycle up does, too",
     )
 
 

@@ -38,12 +38,10 @@ _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE
 
 
 def _verdict(schema: _Schema) -> None:
-    """A verdict is written without what is empty, see `lifecycle.verify.report.to_json`."""
-    del schema["properties"]["blocking"], schema["$defs"]["Finding"]["properties"]["ends"]
+    """A verdict is written without what is as it mostly is."""
     schema["properties"]["judged"] |= {"const": False}
     run = schema["properties"]["run"]
     run |= run.pop("anyOf")[0]
-    schema["required"].remove("blocking")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,11 +233,15 @@ def generate_manifest() -> str:
     )
     found = {each.__name__: each for type_ in types for each in _types(type_)}
     words = {
-        each: [each.value for each in type_] for each, type_ in found.items() if _is_enum(type_)
+        each: [each.value for each in type_ if each.value != "UNKNOWN"]  # that is only observed
+        for each, type_ in found.items()
+        if _is_enum(type_)
     }
     for name, type_ in found.items():
         if name not in words:
             defs[name] = _section(type_, defs[name])
+    for each in defs["Qos"]["properties"].values():
+        each.pop("default", None)  # of the endpoint's kind
     reaction = {"enum": list(get_args(written.Word))}
     for_rules["not"] = {"required": ["mode"]}
     names = [name for each in code_points() for name in (each.name, *each.aliases)]
@@ -360,6 +362,8 @@ class _Opening:
         for key in ("items", "additionalProperties"):
             if isinstance(schema.get(key), dict):
                 schema[key] = self.value(schema[key])
+        if "propertyNames" in schema:
+            schema["propertyNames"] = self._branch(schema["propertyNames"])
         if "enum" in schema:
             words = self.order.get(frozenset(schema["enum"]), schema["enum"])
             schema["enum"] = words if isinstance(words, str) else list(words)
@@ -367,9 +371,8 @@ class _Opening:
                 schema = {"type": "string", **schema}
             if len(words) == 1 and not isinstance(words[0], str):
                 schema["const"] = schema.pop("enum")[0]
-        for each in (schema, schema.get("propertyNames", {})):
-            if "pattern" in each:  # \Z is Python's, and $ ECMA 262's
-                each["pattern"] = each["pattern"].replace(r"\Z", "$")
+        if "pattern" in schema:  # \Z is Python's, and $ ECMA 262's
+            schema["pattern"] = schema["pattern"].replace(r"\Z", "$")
         return schema
 
 

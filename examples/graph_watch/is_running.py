@@ -11,8 +11,8 @@ import sys
 
 from lifecycle.graph.graph import Graph
 from lifecycle.manifest import load
-from lifecycle.plan import build_plan
-from lifecycle.verify import Outcome
+from lifecycle.plan.build import build_plan
+from lifecycle.verify.outcome import Outcome
 
 
 def main() -> int:

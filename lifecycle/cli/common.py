@@ -287,7 +287,6 @@ def machine_option(help_: str) -> Callable[[F], F]:
         "--machine",
         default="",
         metavar="NAME",
-        shell_complete=completing("machines"),
         help=help_,
     )
 
@@ -444,15 +443,11 @@ def _systems() -> list[str]:
 
 
 def _words(kind: str, context: click.Context) -> list[str]:
-    """Return "manifests" and "systems" here, "runs", or what the manifest before has of a kind."""
+    """Return "manifests" and "systems" here, or what the manifest before has of a kind."""
     if kind == "manifests":
         return sorted(each.name for each in Path().glob("*.lifecycle.yaml"))
     if kind == "systems":
         return _systems()
-    if kind == "runs":
-        from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
-
-        return [each.name for each in runs_of(ros_log_root(os.environ), "")]
     import yaml
 
     target = context.params.get("manifest") or context.params.get("target") or ""

@@ -11,10 +11,10 @@ import csv
 import datetime as dt
 import io
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+from msgspec import to_builtins
 from msgspec.structs import asdict, replace
 
 from lifecycle.cli.common import json_of, terminal_width, unwritable, wrapped
@@ -28,23 +28,7 @@ from lifecycle.verify.verdict import FlowReport, Verdict
 
 _MEASURED = ("Hz", "p50 ms", "p99 ms", "lost")
 _NONE = ("",) * len(_MEASURED)
-_HEADS = (
-    "topic",
-    "publisher",
-    "subscription",
-    *("rate_hz", "p50_ms", "p99_ms", "lost"),
-    "source",
-    "destination",
-    "protocol",
-    "flow_label",
-    "dscp",
-    "5qi",
-    "unique",
-    "required",
-    "demanded",
-    "transport",
-    "verdict",
-)
+_HEADS = ("unique", "required", "demanded", "dscp", "5qi", "transport", "flow")
 _UNIQUE = {UniqueHow.NOT: "no", UniqueHow.WEAKLY: "weakly", UniqueHow.STRONGLY: "strongly"}
 
 
@@ -57,9 +41,9 @@ def render_flows(
 ) -> str:
     """Return `flows` as "text", "json" (an array) or "csv" (with a head line).
 
-    In text and CSV a pair has one line for each network flow that its ends form, in JSON they are
-    its `tuples`. `transport` is what carries it, not what could. In JSON `measured` is null where
-    nothing was.
+    In text a pair has a line, below which are the network flows that its ends form; in CSV it has
+    one line for each of these, in JSON they are its `tuples`. `transport` is what carries it, not
+    what could. In JSON `measured` is null where nothing was.
     """
     found = {each.pair: each for each in measured}
     flows = [replace(each, outcome=_outcome(each, found.get(each.pair))) for each in flows]
@@ -70,8 +54,15 @@ def render_flows(
         return lines(flows_to_csv(flows, found).replace("\r\n", "\n").rstrip("\n"))
     if not flows:
         return "no flow"
-    rows = (row for each in flows for row in _rows(each, found.get(each.pair), colour=colour))
-    return "\n".join(columns([_HEADS, *rows]))
+    rows = [
+        (each.outcome.value, *cells(found.get(each.pair), colour=colour), *_treated(each))
+        for each in flows
+    ]
+    head, *shown = columns([("verdict", *_MEASURED, *_HEADS), *rows])
+    for flow, line in zip(flows, shown, strict=True):
+        ends = [each.describe() for each in flow.tuples] or [_unpaired(flow)]
+        head = "\n".join((head, line, *(one_line(f"    {each}") for each in ends)))
+    return head
 
 
 def watched_flows(verdict: Verdict, format_: str) -> str:
@@ -113,65 +104,38 @@ def _outcome(flow: FlowReport, measured: FlowMeasurement | None) -> Outcome:
     return Outcome.worst(found)
 
 
-def _rows(
-    flow: FlowReport, measured: FlowMeasurement | None, *, colour: bool
-) -> Iterator[tuple[str, ...]]:
+def _treated(flow: FlowReport) -> tuple[str, ...]:
+    """Return the cells below _HEADS, printable."""
     # What the data carry, and where that is known what the subscription acknowledges with.
     dscp = "–" if flow.dscp is None else describe(flow.dscp)
     dscp += "" if flow.reader_dscp is None else f"; back {describe(flow.reader_dscp)}"
     five_qi = "–" if flow.five_qi is None else str(flow.five_qi)
-    demands_and_verdict = (
-        dscp,
-        f"{five_qi} (auto)" if flow.five_qi_reason else five_qi,
+    cells = (
         "unknown" if flow.unique is None else _UNIQUE[flow.unique],
         " / ".join(each.value for each in flow.requirement),
         flow.demanded.value,
+        dscp,
+        f"{five_qi} (auto)" if flow.five_qi_reason else five_qi,
         flow.effective_transport,
-        flow.outcome.value,
+        f"{flow.topic} {flow.publisher} → {flow.subscription}",
     )
-    found: list[tuple[str, ...]] = [
-        (each.source, each.destination, each.transport_protocol.value, each.label or "–")
-        for each in flow.tuples
-    ]
-    # An end that forms no IP flow with the other has its network flow endpoints.
-    ends = (
-        " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
-        for nfes in (flow.source, flow.destination)
-    )
-    for each in found or [(*ends, "–", "–")]:
-        pair, rest = (map(one_line, part) for part in (flow.pair, (*each, *demands_and_verdict)))
-        yield (*pair, *cells(measured, colour=colour), *rest)
+    return tuple(map(one_line, cells))
 
 
-COLUMNS: dict[str, Callable[[FlowReport, Any], object]] = {
-    "topic": lambda report, _: report.topic,
-    "publisher": lambda report, _: report.publisher,
-    "subscription": lambda report, _: report.subscription,
-    "transport_protocol": lambda _, flow: flow and flow.transport_protocol.value,
-    "internet_protocol": lambda _, flow: flow and flow.internet_protocol.value,
-    "source_address": lambda _, flow: flow and flow.source_address,
-    "source_port": lambda _, flow: flow and flow.source_port,
-    "destination_address": lambda _, flow: flow and flow.destination_address,
-    "destination_port": lambda _, flow: flow and flow.destination_port,
-    "flow_label": lambda _, flow: flow and flow.label,
-    # Only what was read back from the sockets: an RMW reports 0 whatever is marked.
-    "dscp": lambda report, _: report.dscp,
-    "dscp_name": lambda report, _: None if report.dscp is None else dscp_name(report.dscp),
-    "tos": lambda report, _: None if report.dscp is None else tos(report.dscp),
-    "unique": lambda report, _: report.unique and report.unique.value,
-    "demanded": lambda report, _: report.demanded.value,
-    "publisher_requirement": lambda report, _: report.requirement[0].value,
-    "subscription_requirement": lambda report, _: report.requirement[1].value,
-    "max_delay_ms": lambda report, _: (
-        None if report.max_delay_ms is None else f"{report.max_delay_ms:g}"
-    ),
-    "outcome": lambda report, _: report.outcome.value,
-    "five_qi": lambda report, _: report.five_qi,
-    "five_qi_reason": lambda report, _: report.five_qi_reason,
-    "effective_transport": lambda report, _: report.effective_transport,
-}
-"""Header → cell, of a report and one of its flows. None, something that is not known or does not
-apply, is an empty cell.
+def _unpaired(flow: FlowReport) -> str:
+    """Return the network flow endpoints of two ends that form no IP flow with each other."""
+    ends = ([each.describe() for each in nfes] for nfes in (flow.source, flow.destination))
+    return " → ".join(" ".join(dict.fromkeys(each)) or "unknown" for each in ends)
+
+
+COLUMNS = (
+    *("topic", "publisher", "subscription", "transport_protocol", "internet_protocol"),
+    *("source_address", "source_port", "destination_address", "destination_port", "flow_label"),
+    *("dscp", "dscp_name", "tos", "unique", "demanded"),
+    *("publisher_requirement", "subscription_requirement", "max_delay_ms", "outcome"),
+    *("five_qi", "five_qi_reason", "effective_transport"),
+)
+"""Of CSV. What is not known or does not apply is an empty cell.
 
 `flow_label` is five hex digits, or `unset` where the sender sets none; empty on IPv4.
 """
@@ -185,13 +149,22 @@ def flows_to_csv(flows: Iterable[FlowReport], measured: Mapping[Pair, FlowMeasur
     are what has arrived of the pair, empty where that is not measured.
     """
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*COLUMNS, *NUMBERS))
+    heads = (*COLUMNS, *NUMBERS)
+    writer = csv.DictWriter(text, heads, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for report in flows:
-        found = measured.get(report.pair)
-        numbers = [None] * len(NUMBERS) if found is None else [*found.numbers().values()]
+        numbers = measured[report.pair].numbers() if report.pair in measured else {}
+        of_pair = {**to_builtins(report), **numbers}
+        of_pair["publisher_requirement"], of_pair["subscription_requirement"] = (
+            each.value for each in report.requirement
+        )
+        if report.dscp is not None:
+            of_pair |= {"dscp_name": dscp_name(report.dscp), "tos": tos(report.dscp)}
+        if report.max_delay_ms is not None:
+            of_pair["max_delay_ms"] = f"{report.max_delay_ms:g}"
         for flow in report.tuples or (None,):
-            writer.writerow([*(cell(report, flow) for cell in COLUMNS.values()), *numbers])
+            of_flow = to_builtins(flow) | {"flow_label": flow.label} if flow else {}
+            writer.writerow({**of_flow, **of_pair})
     return text.getvalue()
 
 

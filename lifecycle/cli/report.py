@@ -6,6 +6,7 @@ every exit code. Imports next to nothing: it is opened before the rest of a comm
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -57,10 +58,11 @@ def open_report(path: Path) -> None:
         UsageError: its suffix says no format, or it cannot be written.
     """
     report_format(path)
-    if path.exists() and not (path.is_file() or path.is_dir()):  # who reads a pipe reads it once
-        raise UsageError(f"cannot write report {str(path)!r}: it is no file")
     try:
-        replace_text(path, "")
+        if not _is_stream(path):
+            replace_text(path, "")
+        elif not os.access(path, os.W_OK):
+            raise PermissionError(13, "Permission denied")
     except OSError as error:
         raise unwritable(path, error, "report ") from error
 
@@ -155,6 +157,7 @@ class ReportFile:
     def __init__(self, path: Path | None, *, strict: bool = False) -> None:
         self._path = path
         self._strict = strict
+        self._waits = path is not None and _is_stream(path)
         self._plan: Plan | None = None
         self._ended = False
 
@@ -164,9 +167,10 @@ class ReportFile:
     def begin(self, plan: Plan) -> None:
         """Take the plan that the verdict will be of."""
         self._plan = plan
-        reason = "it never came to its end: the process was killed"
-        if self._path is not None:
-            _replace(self._path, self._text(self._path, _unjudged(reason, ExitCode.INTERNAL)))
+        if not self._waits:
+            reason = "it never came to its end: the process was killed"
+            if self._path is not None:
+                _replace(self._path, self._text(self._path, _unjudged(reason, ExitCode.INTERNAL)))
 
     def end(self, verdict: Verdict, plan: Plan | None = None) -> ExitCode:
         """Write how it ended, of another plan where one was taken since `begin`.
@@ -238,3 +242,8 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
 
     run = RunEnd(reason=reason, reached=None, exit_code=code)
     return replace(NOT_JUDGED, run=run)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether it is a pipe or a terminal, which is written once, in the end."""
+    return path.exists() and not (path.is_file() or path.is_dir())

@@ -331,5 +331,5 @@ def verdict_line(verdict: Verdict) -> str:
     if verdict.flows:
         text += f", {count(len(verdict.flows), 'flow')}"
     if verdict.tolerated:
-        text += f"; tolerated: {', '.join(each.describe() for each in verdict.tolerated)}"
+        text += f"; tolerated: {', '.join(each.name for each in verdict.tolerated)}"
     return one_line(text)

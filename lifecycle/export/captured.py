@@ -117,7 +117,7 @@ class CapturedSystem(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         system: name that the manifest gives it.
-        partial: nodes were left out on purpose.
+        partial: nodes were left out.
         gaps: what is not known of the whole, one sentence each.
     """
 
@@ -136,7 +136,6 @@ def capture(
     system: str,
     domain_id: int,
     discovery_range: DiscoveryRange,
-    namespaces: tuple[str, ...] = (),
     unsettled: str = "",
     programs: Programs | None = None,
 ) -> CapturedSystem:
@@ -149,16 +148,14 @@ def capture(
         system: name to give it.
         domain_id: where it was looked.
         discovery_range: likewise.
-        namespaces: take only nodes in or below one of these; empty takes all.
         unsettled: what discovery still waited for; empty if it had settled.
         programs: how the processes of nodes were started; nodes without are attached to.
     """
     configurations = {each.name: each for each in observation.configurations}
     owners = _owners(configurations)
     nodes = _counted(observation.nodes, owners)
-    within = {name: node for name, node in nodes.items() if _is_within(name, namespaces)}
-    illegal = {name: _node_problem(name) for name in within}
-    chosen = {name: node for name, node in within.items() if not illegal[name]}
+    illegal = {name: _node_problem(name) for name in nodes}
+    chosen = {name: node for name, node in nodes.items() if not illegal[name]}
     endpoints: dict[str, list[ObservedEndpoint]] = {name: [] for name in chosen}
     unknown: list[ObservedEndpoint] = []
     for endpoint in observation.endpoints:
@@ -312,12 +309,6 @@ def _node_problem(name: str) -> str:
     """Return why no manifest can declare a node of this name; empty if one can."""
     namespace, _, base = name.rpartition("/")
     return node_name_problem(base) or namespace_problem(namespace or "/" * name.startswith("/"))
-
-
-def _is_within(name: str, namespaces: tuple[str, ...]) -> bool:
-    return not namespaces or any(
-        name.startswith(f"/{each.strip('/')}/" if each.strip("/") else "/") for each in namespaces
-    )
 
 
 def _keys(nodes: Iterable[str]) -> dict[str, str]:

@@ -193,7 +193,7 @@ def _manifest(system: CapturedSystem, references: Mapping[str, str]) -> dict[str
         name for kind, name in ends if not kind.offers and (kind.other_end, name) not in ends
     }
     policy = {
-        "undeclared_nodes": Noted(value="open", note="gap: nodes of other namespaces were left out")
+        "undeclared_nodes": Noted(value="open", note="gap: nodes were left out")
         if system.partial
         else None,
         "unpublished": Noted(

@@ -23,7 +23,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
-from lifecycle.verify.view import FlowView, View
+from lifecycle.verify.view import FlowView, View, Whose
 
 
 class LineKind(enum.Enum):
@@ -263,8 +263,8 @@ class _Builder:
 
     def nodes(self) -> Iterator[PicturedNode]:
         view = self._view
-        others = {*view.observed, *(each.node for each in view.foreign)} - {*view.planned}
-        unknown = [""] if view.unattributed else []
+        others = {*view.observed, *(each.node for each in view.of(Whose.FOREIGN))} - {*view.planned}
+        unknown = [""] if view.of(Whose.UNKNOWN) else []
         yield from map(self._node, (*view.planned, *sorted(others), *unknown))
 
     def _node(self, name: str) -> PicturedNode:
@@ -345,7 +345,7 @@ class _Builder:
             presence = Presence.PRESENT if each.observed else self._absent
             end = self._end(each.kind, each.name, each.node, presence, notes)
             yield each.kind, each.name, type_ or planned.type, end
-        for other in (*view.undeclared, *view.foreign, *view.unattributed):
+        for other in view.of(Whose.UNDECLARED, Whose.FOREIGN, Whose.UNKNOWN):
             end = self._end(other.kind, other.name, other.node, Presence.UNDECLARED, [])
             yield other.kind, other.name, other.type, end
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -67,18 +68,14 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         prefix: of their keys, `left/arm`; empty for none.
         namespace: before their own, `left/arm`; empty for none.
-        parameters: value and place, by name.
-        remap: new name and place, by the name in the node's code.
         machine: where a node runs that names no machine.
-        supervision: value and place, by key of `Supervision`.
+        values: value and place of what nodes share, by path as in `Node.positions`: `remap.scan`.
     """
 
     prefix: str = ""
     namespace: str = ""
     machine: str = THIS_HOST
-    parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
-    remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
-    supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
+    values: Mapping[str, tuple[Any, Position]] = msgspec.field(default_factory=dict)
 
     def inner(self, root: Document, found: Findings) -> Shared:
         """Return what holds inside a document or group, or in what an include names."""
@@ -91,17 +88,21 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
             )
         elif sim_time is not None and isinstance(sim_time.scalar, bool):
             parameters[SIM_TIME] = (sim_time.scalar, sim_time.key_at())
-        remap = {name: (each.root.text, each.key_at()) for name, each in root.entries("remap")}
         keys = {key: value for key, value in root.plain().items() if key in SUPERVISION_KEYS}
         written = read(keys, Supervision, strict=False)
-        supervision = {key: (getattr(written, key), root.at((key,))) for key in keys}
         return Shared(
             prefix=self.key(root.text("prefix")) if "prefix" in root else self.prefix,
             namespace=self.within(root.text("namespace")),
             machine=root.text("machine", self.machine),
-            parameters={**self.parameters, **parameters},
-            remap={**self.remap, **remap},
-            supervision={**self.supervision, **supervision},
+            values={
+                **self.values,
+                **{f"parameters.{name}": each for name, each in parameters.items()},
+                **{
+                    f"remap.{name}": (each.root.text, each.key_at())
+                    for name, each in root.entries("remap")
+                },
+                **{key: (getattr(written, key), root.at((key,))) for key in keys},
+            },
         )
 
     def key(self, key: str) -> str:
@@ -114,31 +115,26 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
 
     def given_to(self, node: Node) -> Node:
         """Return a node with what it does not set itself; who starts it otherwise restarts it."""
-        own, rules = dict(node.parameters), dict(node.remap)
-        parameters = {name: each for name, each in self.parameters.items() if name not in own}
-        remap = {name: each for name, each in self.remap.items() if name not in rules}
-        supervision = {
-            key: each
-            for key, each in self.supervision.items()
-            if key not in node.positions and node.run.kind is not RunKind.ATTACH
+        is_attached = node.run.kind is RunKind.ATTACH
+        given = {
+            path: each
+            for path, each in self.values.items()
+            if path not in node.positions and not (is_attached and path in SUPERVISION_KEYS)
         }
-        positions = {
-            **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
-            **{f"remap.{name}": at for name, (_, at) in remap.items()},
-            **{key: at for key, (_, at) in supervision.items()},
-        }
-        given = {key: value for key, (value, _) in supervision.items()}
+
+        def those(section: str) -> tuple[tuple[str, Any], ...]:
+            found = ((path.partition(".")[::2], value) for path, (value, _) in given.items())
+            return tuple((name, value) for (of, name), value in found if of == section)
+
+        supervision = {path: value for path, (value, _) in given.items() if "." not in path}
         return replace(
             node,
-            parameters=(
-                *((name, value) for name, (value, _) in parameters.items()),
-                *node.parameters,
-            ),
+            parameters=(*those("parameters"), *node.parameters),
             # rcl takes the first rule that matches: the node's own.
-            remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
-            supervision=replace(node.supervision, **given),
-            shared=node.shared | positions.keys(),
-            positions={**node.positions, **positions},
+            remap=(*node.remap, *those("remap")),
+            supervision=replace(node.supervision, **supervision),
+            shared=node.shared | given.keys(),
+            positions={**node.positions, **{path: at for path, (_, at) in given.items()}},
         )
 
 
@@ -334,7 +330,7 @@ def build_node(
         parameters=tuple((name, value) for name, (value, _) in parameters.items()),
         parameter_files=tuple(absolute(base, each) for each in node.parameter_files),
         remap=tuple(node.remap.items()),
-        after=tuple(_after(part, shared, found)),
+        after=tuple(_after(part, shared)),
         supervision=build(Supervision, node),
         on_violation=node.on_violation.value if node.on_violation else (),
         interface=interface,
@@ -350,23 +346,16 @@ def build_node(
     return shared.given_to(built)
 
 
-def _after(node: Document, shared: Shared, found: Findings) -> Iterator[After]:
+def _after(node: Document, shared: Shared) -> Iterator[After]:
     for name, each in node.entries("after"):
         key = shared.key(name)
         if not isinstance(each.root.data, dict):
             yield After(node=key, condition=Condition(each.scalar), at=each.key_at())
             continue
         for word, shown in each.entries():
-            by, names = ReadyBy(word), list[tuple[str, ParameterValue | None, Position]]()
-            if isinstance(shown.root.data, dict):
-                values = flat_parameters(shown.entries(), found)
-                names += [(name, value, at) for name, (value, at) in values.items()]
-            else:
-                so = True if by is ReadyBy.PARAMETER else None
-                items = shown.items() if isinstance(shown.root.data, tuple) else (shown,)
-                names += [(each.root.text, so, each.at()) for each in items]
-            for named, value, at in names:
-                yield After(node=key, condition=Readiness(by=by, name=named, value=value), at=at)
+            for one in shown.items() if isinstance(shown.root.data, tuple) else (shown,):
+                condition = Readiness(by=ReadyBy(word), name=one.root.text)
+                yield After(node=key, condition=condition, at=one.at())
 
 
 def absolute(base: Path, path: str) -> str:
@@ -405,15 +394,6 @@ def _run(run: RunKeys | None, node: Document, base: Path, shared: Shared, found:
         at = {key: part.key_at((key,)) for key in keys if key in part}
         found += [error(rule, at[key], f"cannot set {key} of {what}", "remove it") for key in at]
     resources = run.resources
-    if resources is not None and resources.memory_high_mib and resources.memory_max_mib:
-        high, most = resources.memory_high_mib, resources.memory_max_mib
-        if high >= most:
-            at_high = part.key_at(("resources", "memory_high_mib"))
-            message = (
-                f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
-            )
-            hint = "set it lower, or leave it out"
-            found.append(error("manifest.resources", at_high, message, hint))
     container = run.container
     return build(
         Run,

@@ -27,7 +27,6 @@ from lifecycle.network.medium import (
     SAFE_DATAGRAM_BYTES,
     Medium,
     is_fragmented,
-    max_unfragmented,
     udp_to,
 )
 
@@ -184,8 +183,7 @@ class FlowNeeds:
         )
         # The size of messages is not known; if the path is known to be narrow, be careful.
         size, declared = need.max_message_size, network.max_datagram_bytes
-        limit = declared or max_unfragmented(ipv6=":" in address)
-        is_small = declared is None if size is None else not is_fragmented(size, limit)
+        is_small = declared is None if size is None else not is_fragmented(size, address, declared)
         # Only a flow that a network knows can be harmed.
         if need.kind is EndpointKind.PUBLISHER and resolved.prioritised and not is_small:
             return replace(resolved, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)

@@ -14,8 +14,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from lifecycle.errors import nearest
-
 _INDEX = Path("share", "ament_index", "resource_index")
 
 
@@ -55,23 +53,6 @@ def types_of(package: str, prefixes: Sequence[Path]) -> tuple[str, ...] | None:
     lines = () if found is None else found.read_text(encoding="utf-8").split()
     types = tuple(dict.fromkeys(str(PurePosixPath(line).with_suffix("")) for line in lines))
     return None if found is None else types
-
-
-def nearest_type(type_: str, prefixes: Sequence[Path]) -> str:
-    """Return the type of its package, else the package, with a similar name; empty without one."""
-    package, _, name = type_.partition("/")
-    types = types_of(package, prefixes)
-    if types is None:
-        import difflib  # only a mistake needs it
-
-        # Packages share endings (`_msgs`, `_interfaces`), so only a near miss is a hint.
-        known = list_resources(_RESOURCE, prefixes)
-        return next(iter(difflib.get_close_matches(package, known, n=1, cutoff=0.85)), "")
-    # A type of the same kind is preferred: `msg/Imu` for `msg/IMU`, not `srv/SetCameraInfo`.
-    kind = name.partition("/")[0]
-    same_kind = [each for each in types if each.startswith(f"{kind}/")]
-    similar = nearest(name, same_kind) or nearest(name, types)
-    return f"{package}/{similar}" if similar else ""
 
 
 _SERVICE = ("_Request", "_Response")

@@ -38,6 +38,7 @@ from lifecycle.manifest.model import (
     ParameterDeclaration,
     ParameterValue,
 )
+from lifecycle.manifest.parameter_values import SCALARS
 from lifecycle.manifest.qos import (
     POLICIES,
     PRESETS,
@@ -126,17 +127,8 @@ def _qos(
     return profile, left_open
 
 
-_TYPES: Mapping[str, Any] = {
-    "bool": bool,
-    "int": int,
-    "double": float,
-    "string": str,
-    "bool_array": tuple[bool, ...],
-    "int_array": tuple[int, ...],
-    "double_array": tuple[float, ...],
-    "string_array": tuple[str, ...],
-    "byte_array": tuple[Octet, ...],
-}
+_ONE = {**{name: type_ for type_, name in SCALARS.items()}, "byte": Octet}
+"""Types of one value of a parameter, by the names of types without `_array`."""
 
 
 def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclaration:
@@ -144,7 +136,9 @@ def _declaration(name: str, part: Document, found: Findings) -> ParameterDeclara
     default: ParameterValue | None = None
     if (value := part.get("default_value")) is not None:
         try:
-            default = msgspec.convert(value.plain(), _TYPES[declared.type])
+            type_: Any = _ONE[declared.type.removesuffix("_array")]
+            is_array = declared.type.endswith("_array")
+            default = msgspec.convert(value.plain(), tuple[type_, ...] if is_array else type_)
         except msgspec.ValidationError:
             what = f"{quote(value.plain())} as default of a parameter of type {declared.type}"
             found.append(error("manifest.parameter-default", value.at(), f"cannot use {what}"))
@@ -195,7 +189,6 @@ def read_interface(
     return Interface(
         endpoints=tuple(reading.endpoints),
         parameters=tuple(reading.parameters),
-        source=reference,
         has_all_parameters=True,
     )
 

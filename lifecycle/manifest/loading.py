@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -104,10 +104,11 @@ def load(
         raise ManifestError(in_order(found, loading.files))
     files = ParameterFiles(manifest.path)
     manifest = settle(_without_left_out(manifest), files, found)
-    if not manifest.nodes and manifest.left_out:
+    if not manifest.nodes:
         at = Position(file=manifest.path, line=1, column=1)
-        message = "cannot run a system without nodes: conditions leave out all of them"
-        hint = "lifecycle check --arguments lists what they follow"
+        why = ": conditions leave out all of them" if manifest.left_out else ""
+        hint = "lifecycle check --arguments lists what they follow" if why else ""
+        message = f"cannot run a system without nodes{why}"
         found.append(error("manifest.condition", at, message, hint))
     if not _has_errors(found):
         found += check(manifest, environment=variables, files=files)
@@ -199,18 +200,6 @@ _SECTIONS = ("discovery", "network", "data_layer", "on_violation")
 """Sections of a document that findings may be about."""
 
 
-class _Reading(msgspec.Struct, frozen=True, kw_only=True):
-    """One file while it is read: places in it are counted from its root.
-
-    Attributes:
-        chain: the manifests that include it, and itself.
-        left_out: places that conditions leave out.
-    """
-
-    chain: tuple[Path, ...]
-    left_out: tuple[Place, ...]
-
-
 NOTHING = Shared()
 
 
@@ -281,12 +270,7 @@ class _Loading:
         substituted = substitute(document, given, surroundings, include=entry)
         self.found += substituted.found
         document = substituted.document
-        emptied = [
-            place[:-1]
-            for place in substituted.left_out
-            if (around_it := document.find(place[:-1])) is not None and not around_it.data
-        ]
-        ignore = [*substituted.broken, *substituted.left_out, *emptied]
+        ignore = [*substituted.broken, *substituted.left_out]
         self.found += validate(document, ignore=ignore)
         if _has_errors(self.found[before:]):
             return
@@ -294,8 +278,7 @@ class _Loading:
         for name, each in document.entries("machines"):
             self._machine(name, each)
         first_link = len(self._links)
-        reading = _Reading(chain=(*chain, path), left_out=tuple(substituted.left_out))
-        self._contents(reading, document, around, entry)
+        self._contents(document, around, entry, (*chain, path), substituted.left_out)
         links = [self._link(each, around) for each in document.items("links")]
         self._links[first_link:first_link] = links
 
@@ -329,7 +312,12 @@ class _Loading:
                 self.found.append(note("manifest.include-ignored", at, message))
 
     def _contents(
-        self, reading: _Reading, root: Document, around: Shared, entry: Document | None
+        self,
+        root: Document,
+        around: Shared,
+        entry: Document | None,
+        chain: tuple[Path, ...],
+        without: Collection[Place],
     ) -> None:
         """Add what a document or group has; `entry` is the group or the include that it came by."""
         shared = around.inner(root, self.found)
@@ -337,7 +325,7 @@ class _Loading:
             node = build_node(
                 key,
                 part,
-                base=reading.chain[-1].parent,
+                base=chain[-1].parent,
                 shared=shared,
                 environment=self._environment,
                 found=self.found,
@@ -352,25 +340,23 @@ class _Loading:
                 self.found.append(error("manifest.duplicate-node", entry.at(), message, hint))
             if node.machine == THIS_HOST:
                 self._machines.setdefault(THIS_HOST, Machine(name=THIS_HOST, at=node.at))
-        left_out = [
-            str(place[-1]) for place in reading.left_out if place[:-1] == (*root.place, "nodes")
-        ]
+        left_out = [str(place[-1]) for place in without if place[:-1] == (*root.place, "nodes")]
         for each in root.items("include"):
-            if each.place not in reading.left_out:
-                path = _locate(each, reading.chain, self.found)
+            if each.place not in without:
+                path = _locate(each, chain, self.found)
                 self._documents += path is not None
                 if path is not None and self._documents <= MAX_MANIFESTS:
                     given = {name: one.root.text for name, one in each.entries("arguments")}
                     inner = shared.inner(each, self.found)
-                    self.read(path, given, chain=reading.chain, entry=each, around=inner)
+                    self.read(path, given, chain=chain, entry=each, around=inner)
                 elif path is not None and self._documents == MAX_MANIFESTS + 1:
                     message = f"cannot include more than {MAX_MANIFESTS} manifests"
                     self.found.append(error("manifest.include", each.at(), message))
             elif (prefix := each.text("prefix")) and "$(" not in prefix:
                 left_out.append(f"{prefix}/")
         for each in root.items("groups"):
-            if each.place not in reading.left_out:
-                self._contents(reading, each, shared, each)
+            if each.place not in without:
+                self._contents(each, shared, each, chain, without)
             else:
                 left_out += _keys_of(each.root)
         self._left_out += map(shared.key, left_out)

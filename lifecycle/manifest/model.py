@@ -7,7 +7,6 @@ Nothing here knows YAML. Pure.
 from __future__ import annotations
 
 import enum
-import json
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -218,8 +217,9 @@ WORD = "[A-Za-z_][A-Za-z0-9_]*"
 
 Text = Annotated[str, Meta(min_length=1)]
 NodeKey = Annotated[
-    str, spelled(rf"^{WORD}(/{WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
+    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
 ]
+Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
 _OCTET = "(25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])"
 IPv4Group = Annotated[
     str,
@@ -249,13 +249,6 @@ Plugin = Annotated[
     ),
     Meta(examples=["image_tools/image_tools::Cam2Image"]),
 ]
-Keyword = Annotated[
-    str, spelled(rf"^{WORD}\Z", "name an argument: letters, digits and '_', not a digit first")
-]
-Variable = Annotated[
-    str, spelled(rf"^{WORD}\Z", "name an environment variable: letters, digits and '_'")
-]
-
 Scalar = bool | int | float | str
 """A value that is one word: where its text counts, whatever scalar it is."""
 
@@ -414,14 +407,14 @@ class RunKeys(ProcessKeys, frozen=True, kw_only=True, omit_defaults=True):
     )
 
     python: PythonName = ""
-    arguments: Mapping[Keyword, ParameterValue] = msgspec.field(default_factory=dict)
+    arguments: Mapping[Name, ParameterValue] = msgspec.field(default_factory=dict)
     executor: Executor = Executor.SINGLE
     threads: Annotated[int, Meta(ge=1, le=256)] | None = None
     command: Annotated[tuple[Scalar, ...], Meta(min_length=1)] = ()
     package: Text = ""
     executable: Text = ""
     attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
-    environment: Mapping[Variable, Scalar] = msgspec.field(default_factory=dict)
+    environment: Mapping[Name, Scalar] = msgspec.field(default_factory=dict)
     working_directory: Text = ""
     component: Plugin = ""
     container: Annotated[Text, Meta(examples=["container", "/robot/container"])] = ""
@@ -464,20 +457,18 @@ class Readiness(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     for before the gate opens, so it must not depend on that.
 
     Attributes:
-        by: that it has a publisher, a server of a service or an action, or a parameter.
+        by: that it has a publisher, a server of a service or an action, or a true parameter.
         name: as the node's own code uses it, before its namespace and its remap rules.
-        value: of the parameter.
     """
 
     by: ReadyBy
     name: str
-    value: ParameterValue | None = None
 
     def __str__(self) -> str:
         """Return it as people read it after the node's name: `publishes scan`."""
         if self.by is not ReadyBy.PARAMETER:
             return f"{self.by.value} {self.name}"
-        return f"has parameter {self.name}: {json.dumps(self.value, ensure_ascii=False)}"
+        return f"has parameter {self.name}: true"
 
 
 class After(msgspec.Struct, frozen=True, kw_only=True):
@@ -663,14 +654,12 @@ class Interface(msgspec.Struct, frozen=True, kw_only=True):
     """What a node offers and needs, in NoDL v2 terms.
 
     Attributes:
-        source: empty when inline, else the reference it was read from.
         has_all_parameters: `parameters` are all that the node has: it is written down, or a NoDL
             document, which describes a node as a whole.
     """
 
     endpoints: tuple[Endpoint, ...] = ()
     parameters: tuple[ParameterDeclaration, ...] = ()
-    source: str = ""
     has_all_parameters: bool = False
 
     def find(self, kind: EndpointKind, name: str) -> Endpoint | None:

@@ -58,8 +58,19 @@ class Liveliness(enum.Enum):
 class QosProfile(msgspec.Struct, frozen=True, kw_only=True):
     """One rmw QoS profile; field names are NoDL v2's.
 
-    Durations are nanoseconds, 0 to 2**63-1; None is rmw's default, which means infinite. `depth`
-    counts messages, >= 1 under KEEP_LAST; 0 where not observable or KEEP_ALL.
+    A duration of None is rmw's default, which means infinite; a depth is 0 where not observable or
+    KEEP_ALL.
+
+    Attributes:
+        history: Which messages are kept.
+        depth: Messages kept under KEEP_LAST, at least 1.
+        reliability: Whether lost messages are sent again.
+        durability: Whether late subscriptions get earlier messages.
+        deadline_ns: Longest time between two messages, nanoseconds.
+        lifespan_ns: Age at which messages expire, nanoseconds.
+        liveliness: Who asserts that the publisher is alive.
+        liveliness_lease_duration_ns: Time without assertion after which a publisher counts as gone,
+            nanoseconds.
     """
 
     history: History = History.KEEP_LAST

@@ -24,9 +24,11 @@ from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
     Dscp,
+    EndpointKind,
     EndpointPolicy,
     Health,
     LinkKeys,
+    Name,
     Network,
     NodeKey,
     Parameter,
@@ -46,6 +48,7 @@ from lifecycle.manifest.model import (
     require,
     spelled,
 )
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.manifest.yaml.document import Document, Place
 from lifecycle.network.dscp import code_points, parse_dscp
 
@@ -77,15 +80,10 @@ B = TypeVar("B", bound=Struct)
 
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
 
-Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
 Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namespace, as in /left")]
-Prefix = Annotated[
-    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
-]
 ConnectionName = Annotated[
     str, spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first")
 ]
-Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
 """What `if:` and `unless:` may be once their substitutions are resolved."""
@@ -241,14 +239,15 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def _interface_type(kind: str, example: str) -> Meta:
     message = f"write package/{kind}/Type, as in {example}"
     return Meta(
+        description=f"ROS type, package/{kind}/Type.",
         pattern=rf"^{_TYPE}/{kind}/{_TYPE}\Z",
         examples=[example],
         extra_json_schema={"patternErrorMessage": message},
     )
 
 
-class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One endpoint.
+class ActionEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One server or client of an action.
 
     Attributes:
         name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
@@ -257,48 +256,26 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     name: Text
+    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
     description: str = ""
 
 
-class ActionEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One server or client of an action.
-
-    Attributes:
-        type: ROS type, package/action/Type.
-    """
-
-    type: Annotated[str, _interface_type("action", "example_interfaces/action/Fibonacci")]
-
-
-class QosEndpoint(Endpoint, frozen=True, kw_only=True):
-    """One endpoint of a topic or service.
+class TopicEndpoint(ActionEndpoint, frozen=True, kw_only=True):
+    """One publisher or subscription.
 
     Attributes:
         qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
             make the endpoint with; nothing requires them.
     """
 
+    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
     qos: Preset | Qos | None = None
 
 
-class ServiceEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One server or client of a service.
-
-    Attributes:
-        type: ROS type, package/srv/Type.
-    """
+class ServiceEndpoint(TopicEndpoint, frozen=True, kw_only=True):
+    """One server or client of a service."""
 
     type: Annotated[str, _interface_type("srv", "std_srvs/srv/Trigger")]
-
-
-class TopicEndpoint(QosEndpoint, frozen=True, kw_only=True):
-    """One publisher or subscription.
-
-    Attributes:
-        type: ROS type, package/msg/Type.
-    """
-
-    type: Annotated[str, _interface_type("msg", "sensor_msgs/msg/Image")]
 
 
 Preset = Literal[
@@ -316,39 +293,22 @@ Preset = Literal[
 """A QoS profile by its ROS name (rmw/qos_profiles.h)."""
 
 
-class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Qos(QosProfile, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """QoS profile, with rmw's names.
 
     What is left out is taken from 'preset', or from the default of the endpoint's kind.
 
     Attributes:
         preset: Preset by its ROS name (rmw/qos_profiles.h).
-        history: Which messages are kept.
-        depth: Messages kept under KEEP_LAST, at least 1.
-        reliability: Whether lost messages are sent again.
-        durability: Whether late subscriptions get earlier messages.
-        deadline_ns: Longest time between two messages, nanoseconds.
-        lifespan_ns: Age at which messages expire, nanoseconds.
-        liveliness: Who asserts that the publisher is alive.
-        liveliness_lease_duration_ns: Time without assertion after which a publisher counts as gone,
-            nanoseconds.
     """
 
     preset: Preset | None = None
-    history: Literal["SYSTEM_DEFAULT", "KEEP_LAST", "KEEP_ALL"] | None = None
-    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] | None = None
-    reliability: Literal["SYSTEM_DEFAULT", "RELIABLE", "BEST_EFFORT", "BEST_AVAILABLE"] | None = (
-        None
-    )
-    durability: (
-        Literal["SYSTEM_DEFAULT", "TRANSIENT_LOCAL", "VOLATILE", "BEST_AVAILABLE"] | None
-    ) = None
-    deadline_ns: Nanoseconds | None = None
-    lifespan_ns: Nanoseconds | None = None
-    liveliness: (
-        Literal["SYSTEM_DEFAULT", "AUTOMATIC", "MANUAL_BY_TOPIC", "BEST_AVAILABLE"] | None
-    ) = None
-    liveliness_lease_duration_ns: Nanoseconds | None = None
+    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 10
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is only observed."""
+        kinds = (self.history, self.reliability, self.durability, self.liveliness)
+        require(all(each.value != "UNKNOWN" for each in kinds))
 
 
 class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -397,15 +357,14 @@ class Ready(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         publishes: Topics that it has publishers of, by the names that its own code uses: relative,
             absolute or ~/private, before its namespace and remapping.
         serves: Services and actions that it has servers of, likewise.
-        parameter: Parameter that it has and that is true; or parameters and the values that they
-            have. Nested mappings are joined with dots.
+        parameter: Parameters that it has and that are true.
     """
 
     ANY_OF: ClassVar[Ways] = (("publishes",), ("serves",), ("parameter",))
 
     publishes: Annotated[Names, Meta(examples=["scan"])] | None = None
     serves: Annotated[Names, Meta(examples=["~/reset"])] | None = None
-    parameter: Text | Annotated[dict[Text, ParameterTree], Meta(min_length=1)] | None = None
+    parameter: Annotated[Names, Meta(examples=["ready"])] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError unless one of its sets of keys is written."""
@@ -424,21 +383,10 @@ class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     subscriptions: dict[str, SubscriptionFlow] = field(default_factory=dict)
 
 
-class MappedEndpoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Declared names of endpoints, by kind.
-
-    Attributes:
-        publishers, subscriptions: Names as the interface declares them.
-        service_servers, service_clients: Names as the interface declares them.
-        action_servers, action_clients: Names as the interface declares them.
-    """
-
-    publishers: tuple[Text, ...] = ()
-    subscriptions: tuple[Text, ...] = ()
-    service_servers: tuple[Text, ...] = ()
-    service_clients: tuple[Text, ...] = ()
-    action_servers: tuple[Text, ...] = ()
-    action_clients: tuple[Text, ...] = ()
+MappedNames = Annotated[
+    dict[EndpointKind, tuple[Text, ...]],
+    Meta(extra_json_schema={"propertyNames": {"enum": [each.value for each in EndpointKind]}}),
+]
 
 
 class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -446,7 +394,8 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         urls: Connection URLs: TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…].
-        map: Declared names of the endpoints that it carries; 'all' for every one of the node.
+        map: Declared names of the endpoints that it carries, by their list in the interface; 'all'
+            for every one of the node.
     """
 
     urls: Annotated[
@@ -458,7 +407,7 @@ class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ],
         ),
     ]
-    map: Literal["all"] | MappedEndpoints = MappedEndpoints()
+    map: Literal["all"] | MappedNames = field(default_factory=dict)
 
 
 class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -525,9 +474,6 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
             require(each.attach is not False and _written(each, each.ONE_OF) == 1)
 
 
-NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
-
-
 class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One other manifest.
 
@@ -545,7 +491,7 @@ class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     unless: Truth | None = None
     arguments: dict[Name, Scalar] = field(default_factory=dict)
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
 
 
 class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -570,7 +516,7 @@ class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True)
     parameters: dict[str, ParameterTree] = field(default_factory=dict)
     remap: dict[Text, Text] = field(default_factory=dict)
     groups: tuple[Group, ...] | None = None
-    nodes: NodesByKey | None = None
+    nodes: dict[Name, Node] | None = None
     include: tuple[Include, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -592,7 +538,7 @@ class Group(Shared, frozen=True, kw_only=True):
     if_: Truth | None = field(name="if", default=None)
     unless: Truth | None = None
     namespace: Namespace = ""
-    prefix: Prefix | None = None
+    prefix: NodeKey | None = None
     machine: Text | None = None
 
 

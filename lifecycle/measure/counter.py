@@ -15,14 +15,12 @@ from collections.abc import Iterable, Mapping
 from lifecycle.measure.sample import (
     DELAY_MESSAGES,
     DELAY_S,
-    LONGEST_NS,
     SLOT_S,
     Delays,
     Sample,
     Slot,
     buckets_of,
-    least_ns,
-    signed_buckets_of,
+    linear_buckets_of,
 )
 
 WARM_UP_S = 0.5
@@ -40,9 +38,8 @@ _MOST_NOTED = 64
 _UNNUMBERED = 1 << 63
 """RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED is larger, no sequence number is."""
 
-_APART_NS = 1 << 26
-"""Delays of another clock that are further from their shift, about 67 ms, get another one: their
-buckets would be larger than a millisecond."""
+_MOST_BUCKETS = 4096
+"""Of one slot; longer delays count as the longest of those."""
 
 _NS = 1e9
 _SLOT_NS = int(SLOT_S * _NS)
@@ -58,13 +55,12 @@ class Counter:
         wall_ns: then, on the clock of the source timestamps; what was published before does not
             count.
         is_apart: the source timestamps are of another host's clock, or of several: delays are
-            counted by how much longer they are than a short one, their shift.
+            counted as the two clocks show them.
     """
 
     def __init__(self, now_ns: int, wall_ns: int, *, is_apart: bool = False) -> None:
         self.is_apart = is_apart
-        self._shift_ns: int | None = None
-        self._buckets_of = signed_buckets_of if is_apart else buckets_of
+        self._buckets_of = linear_buckets_of if is_apart else buckets_of
         self._lock = threading.Lock()
         self._noted: deque[_Noted] = deque()
         self._published_ns = wall_ns + int(WARM_UP_S * _NS)
@@ -119,8 +115,8 @@ class Counter:
                 break
         seconds = len(chosen) * SLOT_S
         return (
-            Delays.of((each[0] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
-            Delays.of((each[1] for each in chosen), seconds=seconds, shift_ns=self._shift_ns),
+            Delays.of((each[0] for each in chosen), seconds=seconds, apart=self.is_apart),
+            Delays.of((each[1] for each in chosen), seconds=seconds, apart=self.is_apart),
         )
 
     def _count(self, noted: Iterable[_Noted]) -> None:
@@ -159,29 +155,11 @@ class Counter:
             return
         self._messages += len(used)
         self._slot_messages += len(used)
-        if self.is_apart:
-            used, received = self._shifted(used, received)
-        self._used.update(self._buckets_of(used))
-        self._received.update(self._buckets_of(received))
-
-    def _shifted(self, used: list[int], received: list[int]) -> tuple[list[int], list[int]]:
-        """Return by how much delays are longer than a short one."""
-        least = min(used)
-        shift = self._shift_ns = least if self._shift_ns is None else self._shift_ns
-        if not (least - shift > -_APART_NS and max(used) - shift < LONGEST_NS):
-            self._move_shift(least - shift)
-            shift = least
-        return [each - shift for each in used], [each - shift for each in received]
-
-    def _move_shift(self, by_ns: int) -> None:
-        self._shift_ns = (self._shift_ns or 0) + by_ns
-        kept = (counts for slot in self._delays for counts in slot)
-        for counts in (self._used, self._received, *kept):
-            before = tuple(counts.items())
-            counts.clear()
-            for bucket, number in before:
-                (moved,) = signed_buckets_of((least_ns(bucket) - by_ns,))
-                counts[moved] += number
+        for counts, delays in ((self._used, used), (self._received, received)):
+            counts.update(self._buckets_of(delays))
+            while len(counts) > _MOST_BUCKETS:
+                longest = counts.pop(max(counts))
+                counts[max(counts)] += longest
 
     def _close_slots(self, now_ns: int) -> None:
         while now_ns - self._slot_ns >= _SLOT_NS:
@@ -189,9 +167,6 @@ class Counter:
             self._delays.append((self._used, self._received))
             self._keep(Slot(seconds=SLOT_S, messages=self._slot_messages, lost=self._slot_lost))
             self._open()
-            lately = [min(used) for used, _ in self._delays if used][-2:]
-            if self.is_apart and len(lately) > 1 and least_ns(min(lately)) > _APART_NS:
-                self._move_shift(least_ns(min(lately)))
 
     def _keep(self, slot: Slot) -> None:
         for level in self._levels:

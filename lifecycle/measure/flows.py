@@ -17,7 +17,7 @@ import msgspec
 
 from lifecycle.codec import Count, says
 from lifecycle.measure.clock import SAME_CLOCK, ClockOffset
-from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, ERROR, Delays, Sample, Slot
+from lifecycle.measure.sample import DELAY_MESSAGES, DELAY_S, LINEAR_NS, Delays, Sample, Slot
 from lifecycle.printable import count
 
 RATE_S = 2.0
@@ -128,8 +128,7 @@ def _delay(bound: Bound, sample: Sample, delays: Delays, clock: ClockOffset | No
         observed = f"{bound.kind.value} {percentile(bound.quantile)} {ms(delay_ms)}"
         share = delay_ms / bound.most
         if clock.uncertainty_ms:
-            # The bucket from which it was read is as large as this at most.
-            unsure_ms += ERROR * abs(found - (delays.shift_ns or 0) / 1e6)
+            unsure_ms += LINEAR_NS / 1e6  # the bucket from which it was read is as large
             observed += f" ± {ms(unsure_ms)}"
         is_late = delay_ms - unsure_ms > bound.most
         if is_late and delays.messages < max(DELAY_MESSAGES, LATE_MESSAGES / (1 - bound.quantile)):

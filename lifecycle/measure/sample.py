@@ -12,7 +12,7 @@ from typing import Annotated
 
 import msgspec
 
-from lifecycle.codec import Count
+from lifecycle.codec import LARGEST, Count
 
 _PART_BITS = 6
 _PARTS = 1 << _PART_BITS
@@ -22,6 +22,9 @@ LONGEST_NS = (1 << 43) - 1
 
 ERROR = 1 / _PARTS
 """A quantile is at most this share below the exact one, and never above it."""
+
+LINEAR_NS = 10_000
+"""Width of a bucket where two clocks are apart: less than is known of them."""
 
 _NS_PER_MS = 1e6
 
@@ -36,26 +39,20 @@ def buckets_of(delays_ns: Iterable[int]) -> list[int]:
     ]
 
 
-def signed_buckets_of(delays_ns: Iterable[int]) -> list[int]:
-    """Return the buckets of differences of two delays, which may be negative."""
-    return [
-        bucket if each >= 0 else -bucket
-        for each in delays_ns
-        for bucket in buckets_of((abs(each),))
-    ]
+def linear_buckets_of(delays_ns: Iterable[int]) -> list[int]:
+    """Return the buckets of delays by two clocks, negative ones too: all are LINEAR_NS wide."""
+    return [each // LINEAR_NS for each in delays_ns]
 
 
 def least_ns(bucket: int) -> int:
-    """Return the shortest delay of a bucket."""
-    if bucket < 0:
-        return 1 - least_ns(1 - bucket)
+    """Return the shortest delay of a bucket of one clock."""
     shift = max((bucket >> _PART_BITS) - 1, 0)
     return (bucket - (shift << _PART_BITS)) << shift
 
 
 (LAST_BUCKET,) = buckets_of((LONGEST_NS,))
 
-Bucket = Annotated[int, msgspec.Meta(ge=-LAST_BUCKET, le=LAST_BUCKET)]
+Bucket = Annotated[int, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
 
 
 class Delays(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,30 +61,28 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         seconds: how long it took them all to arrive.
         buckets: those with delays in them, in order, and how many there are in each.
-        shift_ns: added to each of those of a publisher on another host: how far its clock is ahead
-            is not known where they are counted, and small delays have small buckets; None where
-            all are of one clock.
+        apart: the publisher is on another host: how far its clock is ahead is not known where they
+            are counted, so that all buckets are LINEAR_NS wide.
     """
 
     seconds: float = 0.0
     buckets: tuple[tuple[Bucket, Count], ...] = ()
-    shift_ns: int | None = None
+    apart: bool = False
 
     @classmethod
     def of(
-        cls,
-        counts: Iterable[dict[int, int]],
-        *,
-        seconds: float = 0.0,
-        shift_ns: int | None = None,
+        cls, counts: Iterable[dict[int, int]], *, seconds: float = 0.0, apart: bool = False
     ) -> Delays:
         """Add up histograms, each the number of delays by bucket."""
         total: dict[int, int] = {}
         for each in counts:
             for found, number in each.items():
-                bucket = max(-LAST_BUCKET, min(found, LAST_BUCKET))
+                bucket = found if apart else min(found, LAST_BUCKET)
                 total[bucket] = total.get(bucket, 0) + number
-        return cls(seconds=seconds, buckets=tuple(sorted(total.items())), shift_ns=shift_ns)
+        return cls(seconds=seconds, buckets=tuple(sorted(total.items())), apart=apart)
+
+    def _least_ms(self, bucket: int) -> float:
+        return (bucket * LINEAR_NS if self.apart else least_ns(bucket)) / _NS_PER_MS
 
     @property
     def messages(self) -> int:
@@ -107,13 +102,12 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
         for bucket, number in self.buckets:
             rank -= number
             if rank <= 0:
-                return (least_ns(bucket) + (self.shift_ns or 0)) / _NS_PER_MS
+                return self._least_ms(bucket)
         raise AssertionError("the ranks of a histogram end with its messages")
 
     def later_than(self, ms: float) -> int:
         """Return how many messages were later than this for certain, milliseconds."""
-        longest_ns = ms * _NS_PER_MS - (self.shift_ns or 0)
-        return sum(number for bucket, number in self.buckets if least_ns(bucket) > longest_ns)
+        return sum(number for bucket, number in self.buckets if self._least_ms(bucket) > ms)
 
 
 SLOT_S = 0.5

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import ipaddress
-import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode, urlsplit
@@ -25,10 +24,8 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 import msgspec
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.network.medium import SCHEMES, Medium, udp_to
+from lifecycle.network.medium import CONNECTABLE, Medium, udp_to
 from lifecycle.network.nfe import is_wildcard
-
-_DISCOVERY_SERVER = re.compile(r"[0-9a-fA-F]{2}(\.[0-9a-fA-F]{2}){11}")
 
 
 class ConnectionUrlError(LifecycleError):
@@ -76,16 +73,8 @@ def _peer(name: str, value: str) -> Peer:
     return Peer(address=address, port=port)
 
 
-def _prefix(name: str, value: str) -> str:
-    if not _DISCOVERY_SERVER.fullmatch(value):
-        raise ConnectionUrlError(
-            f"{name}={value!r} is no GUID prefix: twelve bytes in hex with dots between them"
-        )
-    return value.lower()
-
-
-_UDP = frozenset(each for each in SCHEMES if each.is_udp)
-_IP = frozenset(each for each in SCHEMES if each.is_network)
+_UDP = frozenset(each for each in CONNECTABLE if each.is_udp)
+_IP = frozenset(each for each in CONNECTABLE if each.is_network)
 
 
 class Option(NamedTuple):
@@ -100,19 +89,14 @@ class Option(NamedTuple):
 
 
 _PORT = functools.partial(_number, range(1, 65536))
-_DATAGRAM = functools.partial(_number, range(500, 65501))
 OPTIONS = {
     "metatraffic_port": Option("metatraffic_port", _PORT, _UDP),
     "output_port": Option("output_port", _PORT, _UDP),
     "peer": Option("peers", _peer, _IP),
     "multicast": Option("multicast", _switch, _UDP),
     "server": Option("server", _peer, _IP),
-    "server_prefix": Option("server_prefix", _prefix, _IP),
     "ttl": Option("ttl", functools.partial(_number, range(256)), _UDP),
     "interface": Option("interfaces", lambda _, value: value, _UDP),
-    "dscp": Option("dscp", functools.partial(_number, range(64)), _UDP),
-    "max_datagram_bytes": Option("max_datagram_bytes", _DATAGRAM, _UDP),
-    "non_blocking_send": Option("non_blocking_send", _switch, _UDP),
 }
 
 
@@ -155,13 +139,8 @@ class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
             looked for.
         multicast: discovery also announces by multicast, UDP only.
         server: discovery servers; the participant becomes their client and finds no others.
-        server_prefix: GUID prefix of the first server; those after it count up in the byte that
-            `fast-discovery-server -i ID` sets.
         ttl: hops of what is sent, 0–255; 0 stays on this host. None leaves it to the middleware.
         interfaces: only these are used, by address or name; empty for all.
-        dscp: 0–63 on the sender sockets; None leaves them.
-        max_datagram_bytes: longest UDP payload before RTPS splits messages; None leaves it.
-        non_blocking_send: never wait for room in a socket's buffer.
     """
 
     transport: Medium
@@ -172,12 +151,8 @@ class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
     peers: tuple[Peer, ...] = ()
     multicast: bool = True
     server: tuple[Peer, ...] = ()
-    server_prefix: str = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
     ttl: int | None = None
     interfaces: tuple[str, ...] = ()
-    dscp: int | None = None
-    max_datagram_bytes: int | None = None
-    non_blocking_send: bool = False
 
     def __str__(self) -> str:
         """Return the URL; `parse` of it is equal to this."""
@@ -212,16 +187,18 @@ def check_together(urls: Sequence[ConnectionUrl]) -> None:
     Raises:
         ConnectionUrlError: names two of them.
     """
+
+    def refuse(what: str, hint: str) -> None:
+        raise ConnectionUrlError(f"cannot {what}", hint=hint)
+
     for family in dict.fromkeys(url.family for url in urls):
         same = [url for url in urls if url.family is family]
         some = [url for url in same if url.bound]
         free = [url for url in same if not (url.bound or url.transport.is_group)]
         if some and free:
-            raise ConnectionUrlError(
-                f"cannot use {str(free[0])!r} on all interfaces and {str(some[0])!r} on some: one "
-                "participant has one transport for both",
-                hint="give both an address or interface=",
-            )
+            both = f"{str(free[0])!r} on all interfaces and {str(some[0])!r} on some"
+            why = "one participant has one transport for both"
+            refuse(f"use {both}: {why}", "give both an address or interface=")
         one_port = ("port",) if family.is_tcp else ()
         for option in ("ttl", "output_port", "metatraffic_port", *one_port):
             values = {getattr(url, option): url for url in same}
@@ -229,25 +206,18 @@ def check_together(urls: Sequence[ConnectionUrl]) -> None:
             if len(values) > 1:
                 spelt = " and ".join(repr(str(url)) for url in values.values())
                 what = "TCP port" if option == "port" else option
-                raise ConnectionUrlError(
-                    f"cannot use {spelt} together: one participant has one {what}",
-                    hint="give them to different connections",
-                )
+                why = f"one participant has one {what}"
+                refuse(f"use {spelt} together: {why}", "give them to different connections")
     fixed = [url for url in urls if url.transport.is_udp and url.port]
     if fixed and not all(url.transport.is_network for url in urls):
-        raise ConnectionUrlError(
-            f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
-            "where shared memory listens, so it would not",
-            hint="leave shm:// or the port out",
-        )
+        why = "with fixed ports shared memory would not listen"
+        refuse(f"use 'shm://' beside {str(fixed[0])!r}: {why}", "leave shm:// or the port out")
     servers = [url for url in urls if url.server]
     peers = [url for url in urls if url.peers]
     if servers and peers:
-        raise ConnectionUrlError(
-            f"cannot look for peers {str(peers[0])!r} as a client of {str(servers[0])!r}: a client "
-            "of a discovery server finds nobody else",
-            hint="leave peer= or server= out",
-        )
+        both = f"{str(peers[0])!r} as a client of {str(servers[0])!r}"
+        why = "a client of a discovery server finds nobody else"
+        refuse(f"look for peers {both}: {why}", "leave peer= or server= out")
 
 
 def parse(text: str) -> ConnectionUrl:
@@ -274,11 +244,11 @@ def _parsed(text: str) -> ConnectionUrl:
         raise ConnectionUrlError(bad, hint=_HOW) from error
     # urlsplit takes no scheme with an underscore (RFC 3986 §3.1), `zmq_pgm` of the article.
     scheme = parts.scheme or (text.partition("://")[0] if "://" in text else "")
-    transport = next((each for each in SCHEMES if each == scheme), None)
+    transport = next((each for each in CONNECTABLE if each == scheme), None)
     if transport is None:
         raise ConnectionUrlError(
-            f"unknown transport {scheme!r}; allowed: {', '.join(SCHEMES)}",
-            hint=did_you_mean(scheme, SCHEMES) or _HOW,
+            f"unknown transport {scheme!r}; allowed: {', '.join(CONNECTABLE)}",
+            hint=did_you_mean(scheme, CONNECTABLE) or _HOW,
         )
     if parts.path not in ("", "/") or parts.fragment or parts.username or parts.password:
         raise ConnectionUrlError("only address, port and options are allowed", hint=_HOW)

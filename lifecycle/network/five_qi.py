@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from lifecycle.codec import from_json, read_table
+from lifecycle.codec import read_table
 from lifecycle.network.dscp import parse_dscp
 
 
@@ -202,15 +202,3 @@ def dscp_mapping(name: str) -> DscpMapping:
             return each
     known = ", ".join(each.name for each in dscp_mappings())
     raise ValueError(f"cannot find 5QI to DSCP mapping {name!r}; shipped are {known}")
-
-
-def parse_mapping(text: str | bytes) -> DscpMapping:
-    """Read a user's own mapping.
-
-    Raises:
-        ValueError: not JSON of that shape, an unknown 5QI, or not a DSCP.
-    """
-    try:
-        return from_json(text, DscpMapping)
-    except ValueError as error:
-        raise ValueError(f"cannot read 5QI to DSCP mapping: {error}") from error

@@ -61,11 +61,6 @@ class Medium(str, enum.Enum):
         return self.is_group or not self.is_network
 
     @property
-    def connects(self) -> bool:
-        """Whether connections are made of it, and connection URLs have it as their scheme."""
-        return self not in (Medium.TCPV6, Medium.INTRAPROCESS)
-
-    @property
     def ip_version(self) -> int | None:
         """4 or 6; None where it is either, or no IP."""
         return {"v4": 4, "v6": 6}.get(self.value[-2:])
@@ -124,15 +119,9 @@ LOOPBACK6 = "::1"
 NETWORK_MEDIA = frozenset(each for each in Medium if each.is_network)
 """Media whose packets a network sees."""
 
-CONNECTABLE = tuple(
-    sorted(
-        (each for each in Medium if each.connects), key=lambda each: (each.is_tcp, each.is_group)
-    )
-)
-"""Media that connections are made of, in the order in which a node reports them."""
-
-SCHEMES = tuple(sorted(CONNECTABLE, key=lambda each: not each.is_network))
-"""The same, in the order in which the schemes of connection URLs are listed."""
+CONNECTABLE = (Medium.SHM, Medium.UDPV4, Medium.UDPV6, Medium.UDPM, Medium.TCPV4)
+"""Media that connections are made of, and schemes of connection URLs, in the order in which a node
+reports them."""
 
 UDP_UNICAST = tuple(each for each in CONNECTABLE if each.is_udp and not each.is_group)
 """By what participants are probed, and found without a discovery server."""
@@ -222,31 +211,20 @@ class FlowTransport(enum.Enum):
         return medium in also.get(self, ())
 
 
-_MTU = 1500
-"""Bytes of IP packet that Ethernet carries, and that a path has unless one knows better."""
-
 SAFE_DATAGRAM_BYTES = 1400
 """What we ask of a transport: leaves room below an Ethernet MTU for tunnels on the way."""
 
-_UDP_HEADER = 8
-_IP_HEADER = {False: 20, True: 40}
 
-RTPS_OVERHEAD_BYTES = 20 + 16 + 12 + 24 + 32
-"""Around one message: RTPS header, INFO_DST, INFO_TS, DATA and, from reliable writers, HEARTBEAT
-(DDSI-RTPS 9.4)."""
+def is_fragmented(message_bytes: int, address: str, max_datagram_bytes: int | None = None) -> bool:
+    """Return whether IP splits a serialized message that RTPS does not split.
 
-
-def max_unfragmented(*, ipv6: bool) -> int:
-    """Return the largest UDP payload, bytes, that Ethernet carries unsplit: 1472, IPv6 1452."""
-    return _MTU - _IP_HEADER[ipv6] - _UDP_HEADER
-
-
-def datagram_bytes(message_bytes: int) -> int:
-    """Return the UDP payload, bytes, of a serialized message that RTPS does not split."""
-    padded = (message_bytes + 3) // 4 * 4  # submessages start at multiples of 4
-    return padded + RTPS_OVERHEAD_BYTES
-
-
-def is_fragmented(message_bytes: int, max_datagram_bytes: int) -> bool:
-    """Return whether IP splits a message, if a UDP payload may have so many bytes at most."""
-    return datagram_bytes(message_bytes) > max_datagram_bytes
+    Args:
+        message_bytes: its size.
+        address: of the host that sends it; empty for IPv4.
+        max_datagram_bytes: UDP payload that the path carries whole; None for Ethernet's, 1472 or,
+            over IPv6, 1452.
+    """
+    # Submessages start at multiples of 4. Around one: RTPS header, INFO_DST, INFO_TS, DATA and,
+    # from reliable writers, HEARTBEAT (DDSI-RTPS 9.4).
+    payload = (message_bytes + 3) // 4 * 4 + 20 + 16 + 12 + 24 + 32
+    return payload > (max_datagram_bytes or (1452 if ":" in address else 1472))

@@ -44,27 +44,8 @@ def domain_of(text: str) -> int | None:
     return domain if (domain := int(text)) <= MAX_DOMAIN_ID else None
 
 
-class EphemeralRange(msgspec.Struct, frozen=True, kw_only=True):
-    """Ports that an operating system gives to sockets bound to no port; both ends belong to it."""
-
-    first: int
-    last: int
-
-    def __post_init__(self) -> None:
-        if not 0 < self.first <= self.last <= MAX_PORT:
-            raise ValueError(
-                f"cannot use ephemeral port range {self}; use 1 to {MAX_PORT}, lower end first"
-            )
-
-    def __contains__(self, port: int) -> bool:
-        return self.first <= port <= self.last
-
-    def __str__(self) -> str:
-        return f"{self.first}–{self.last}"
-
-
-LINUX = EphemeralRange(first=32768, last=60999)
-"""The default, which net.ipv4.ip_local_port_range changes."""
+LINUX = range(32768, 61000)
+"""Ports that Linux gives to sockets bound to none; net.ipv4.ip_local_port_range changes it."""
 
 
 class ParticipantPorts(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,19 +62,6 @@ class Capacity(msgspec.Struct, frozen=True, kw_only=True):
 
     participants: int
     limit: str
-
-
-class PortUse(msgspec.Struct, frozen=True, kw_only=True):
-    """What the formula assigns a port to.
-
-    Attributes:
-        role: the field name in ParticipantPorts.
-        participant_id: 0–119; None for the multicast ports.
-    """
-
-    domain_id: int
-    role: str
-    participant_id: int | None
 
 
 def domain_base(domain_id: int) -> int:
@@ -145,49 +113,28 @@ def unicast_pairs(
     return [(port, port + between) for port in range(first.discovery_unicast, end, PG)]
 
 
-def owner_of(port: int) -> PortUse | None:
-    """Return the domain and role that the formula gives a port; None where it gives none."""
-    domain_id, offset = divmod(port - PB, DG)
-    if not 0 <= domain_id <= MAX_DOMAIN_ID or port > MAX_PORT:
-        return None
-    if offset in (D0, D2):
-        role = "discovery_multicast" if offset == D0 else "user_multicast"
-        return PortUse(domain_id=domain_id, role=role, participant_id=None)
-    if offset < D1:
-        return None
-    participant_id, unicast = divmod(offset - D1, PG)
-    role = "user_unicast" if unicast else "discovery_unicast"
-    return PortUse(domain_id=domain_id, role=role, participant_id=participant_id)
+def max_participants(domain_id: int, ephemeral: range) -> Capacity:
+    """Return how many participants of a domain fit on one host, each process being at least one.
 
-
-def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
-    """Return what else the unicast ports of this participant belong to, in the domains above.
-
-    Empty up to participant 119; that after it has the multicast ports of the next domain.
+    `ephemeral` are the ports that its operating system gives to other sockets; it may be empty.
     """
-    ports = participant_ports(domain_id, participant_id)
-    uses = (owner_of(ports.discovery_unicast), owner_of(ports.user_unicast))
-    return tuple(each for each in uses if each is not None and each.domain_id != domain_id)
-
-
-def max_participants(domain_id: int, ephemeral: EphemeralRange) -> Capacity:
-    """Return how many participants of a domain fit on one host, each process being at least one."""
     base = domain_base(domain_id)
     found = [((MAX_PORT - base - D3) // PG + 1, f"the highest port, {MAX_PORT}")]
     if domain_id < MAX_DOMAIN_ID:
         next_domain = f"the ports of domain {domain_id + 1}, from {base + DG}"
         found.append((PARTICIPANTS_PER_DOMAIN, next_domain))
-    inside = f"the ephemeral ports {ephemeral}"
-    if base + D0 in ephemeral or base + D2 in ephemeral:
-        found.append((0, f"{inside}: they hold its multicast ports"))
-    elif ephemeral.last >= base + D1:
-        # The first participant whose upper port is not below the range is the first inside it.
-        found.append((max(0, -(-(ephemeral.first - base - D3) // PG)), inside))
+    if ephemeral:
+        inside = f"the ephemeral ports {ephemeral[0]}–{ephemeral[-1]}"
+        if base + D0 in ephemeral or base + D2 in ephemeral:
+            found.append((0, f"{inside}: they hold its multicast ports"))
+        elif ephemeral[-1] >= base + D1:
+            # The first participant whose upper port is not below the range is the first inside it.
+            found.append((max(0, -(-(ephemeral[0] - base - D3) // PG)), inside))
     participants, limit = min(found, key=lambda each: each[0])
     return Capacity(participants=participants, limit=limit)
 
 
-def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
+def safe_domains(ephemeral: range) -> tuple[range, ...]:
     """Return the domain ids whose first participant is clear of the ephemeral ports, as runs."""
     found: list[range] = []
     for domain in range(MAX_DOMAIN_ID + 1):
@@ -200,7 +147,7 @@ def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
     return tuple(found)
 
 
-def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
+def read_ephemeral_range(read: Callable[[str], str]) -> range:
     """Return this machine's real ephemeral range (ip(7), ip_local_port_range).
 
     `read` returns the text of a file, so that this room opens nothing.
@@ -210,10 +157,8 @@ def read_ephemeral_range(read: Callable[[str], str]) -> EphemeralRange:
         ValueError: the file does not hold two ports.
     """
     text = read(EPHEMERAL_RANGE_FILE)
-    numbers = text.split()
-    if len(numbers) != 2 or not all(each.isdecimal() for each in numbers):
-        raise ValueError(f"cannot read {EPHEMERAL_RANGE_FILE}: {text!r} is not two ports")
-    return EphemeralRange(first=int(numbers[0]), last=int(numbers[1]))
+    first, last = map(int, text.split())
+    return range(first, last + 1)
 
 
 def unique_flow_ports() -> range:

@@ -33,7 +33,7 @@ from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.process_table import vouch_for
 from lifecycle.middleware.rcl.conversions import from_rclpy
 from lifecycle.middleware.rcl.graph_queries import is_server_matched, own_endpoint, prefix_of
-from lifecycle.network.medium import CONNECTABLE, Medium
+from lifecycle.network.medium import CONNECTABLE
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.connections import Connection, Connections
 from lifecycle.node.endpoint import CLIENTS, Endpoint, count_peers
@@ -77,7 +77,6 @@ class HostedState(msgspec.Struct, frozen=True, kw_only=True):
 
 _CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - what Fast DDS uses
-_IPV6_ADDRESSES = "/proc/net/if_inet6"
 
 
 @functools.lru_cache(maxsize=1)
@@ -88,20 +87,8 @@ def transports() -> tuple[str, ...]:
     """
     if get_rmw_implementation_identifier() != _CONFIGURABLE_RMW:
         return ()
-    return tuple(sorted(each for each in CONNECTABLE if _is_here(each)))
-
-
-def _is_here(medium: Medium) -> bool:
-    """Whether this host has what a medium needs."""
-    if not medium.is_network:
-        return os.access(_SHARED_MEMORY, os.W_OK)
-    if medium.ip_version != 6:
-        return True
-    try:
-        with open(_IPV6_ADDRESSES, encoding="ascii") as file:  # noqa: PTH123 - in each host
-            return bool(file.read().strip())
-    except OSError:  # a kernel without IPv6
-        return False
+    shares_memory = os.access(_SHARED_MEMORY, os.W_OK)
+    return tuple(sorted(each for each in CONNECTABLE if each.is_network or shares_memory))
 
 
 _DIGITS = 16

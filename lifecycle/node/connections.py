@@ -114,14 +114,6 @@ class Connections:
             hint=(f"did you mean {near!r}? " if near else "") + f"connected: {listed}",
         )
 
-    def free_name(self) -> str:
-        """Return a name that no connection has."""
-        taken = {each.name for each in self.named}
-        number = 1
-        while f"connection_{number}" in taken:
-            number += 1
-        return f"connection_{number}"
-
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make the participant of a named connection; one that exists so already is returned.
 

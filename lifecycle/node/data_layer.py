@@ -25,17 +25,15 @@ from lifecycle.node.endpoint import (
     Endpoint,
     Handover,
     Placement,
-    UnknownEndpointError,
     count_peers,
     expand,
     find_endpoint,
     make_entity,
-    refuse_unfit,
     unmake,
     watch_matches,
 )
 from lifecycle.node.gate import DeclaredPublisher, Kept
-from lifecycle.node.handlers import Key, alternatives, needs_handler
+from lifecycle.node.handlers import Key, needs_handler
 from lifecycle.node.machine import NodeState
 from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint
 
@@ -98,15 +96,19 @@ class DataLayer:
     def declare(self, planned: PlannedEndpoint, callback: Callable[..., Any] | None) -> Endpoint:
         """Have one more endpoint, made at once where the others are.
 
-        What a manifest says of the same name is kept. The same line may declare the same again:
-        on_activate runs more than once. Raises LifecycleError.
+        What a manifest says of the same name is kept. The same may be declared again: on_activate
+        runs more than once. Raises LifecycleError.
         """
         is_early = self._managed.state is NodeState.UNCONFIGURED
         if not is_early:
             self._refuse_late(planned)
         endpoint = self._declared.get((planned.kind, planned.name))
         if endpoint is not None:
-            _refuse_other(planned, endpoint.planned)
+            if endpoint.planned.type != planned.type:
+                raise LifecycleError(
+                    f"cannot declare {endpoint.spelling} of {self._name} as {planned.type}: "
+                    f"it is declared as {endpoint.planned.type} already"
+                )
         else:
             endpoint = Endpoint(planned=planned, callback=callback, is_late=not is_early)
             if not is_early:
@@ -151,16 +153,9 @@ class DataLayer:
             self._forget(endpoint)
             raise
 
-    def hint(self, endpoint: Endpoint, lossy: bool | None, size_bytes: int | None) -> None:
-        """Keep the author's hints on an endpoint; None leaves what was said before."""
-        endpoint.lossy = endpoint.lossy if lossy is None else lossy
-        endpoint.size_bytes = endpoint.size_bytes if size_bytes is None else size_bytes
-        self._changed()
-
     def set_options(self, spelling: str, options: dict[str, Any]) -> None:
         """Keep how an endpoint is to be made: LifecycleNode.set_options."""
         endpoint = self.find(spelling)
-        refuse_unfit(endpoint.kind, options)
         if endpoint.placement is not None:
             raise LifecycleError(
                 f"cannot set options of {endpoint.spelling} of {self._name}: it exists already",
@@ -175,15 +170,8 @@ class DataLayer:
         return declared[find_endpoint(spelling, declared, node=self._name)]
 
     def declared(self, kind: EndpointKind, name: str) -> Endpoint:
-        """Return a declared endpoint; raises UnknownEndpointError."""
-        endpoint = self.endpoints.get((kind, name))
-        if endpoint is not None:
-            return endpoint
-        if not self.endpoints:
-            hint = "endpoints are declared at configure; ask for it in on_configure or later"
-        else:
-            hint = alternatives(name, [n for k, n in self.endpoints if k is kind])
-        raise UnknownEndpointError(f"cannot find {kind.noun} {name!r} of {self._name}", hint=hint)
+        """Return a declared endpoint, from configure on; raises UnknownEndpointError."""
+        return self.endpoints[find_endpoint(kind.spell(name), self.endpoints, node=self._name)]
 
     def entity(self, kind: EndpointKind, name: str) -> Any:
         """Return the rclpy object of a declared endpoint: LifecycleNode.client."""
@@ -322,9 +310,7 @@ class DataLayer:
 
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make a connection, or return the present one: LifecycleNode.connect_to."""
-        where = ", ".join(how.urls) or repr(name)
-        self._refuse_unconfigured(f"connect {self._name} to {where}")
-        name = name or self.connections.free_name()
+        self._refuse_unconfigured(f"connect {self._name} to {name!r}")
         try:
             return self.connections.connect_to(name, how)
         finally:
@@ -488,27 +474,18 @@ class DataLayer:
 
     def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
         """Keep a strictly unique publisher alone: a participant's publishers share its sockets."""
-        publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
-        if endpoint.kind is not publisher:
+        if endpoint.kind is not EndpointKind.PUBLISHER:
             return
-        if connection.participant is None:
-            if endpoint.planned.unique is strict:
-                raise ConnectError(
-                    f"publisher {endpoint.name!r} must have a network flow for itself "
-                    "(strictly_required), and those of the node's own participant share one",
-                    hint="give it a connection of its own",
-                )
-            return
-        for other in self.endpoints.values():
-            if other is endpoint or (other.kind, other.connection) != (publisher, connection):
-                continue
-            for one, two in ((endpoint, other), (other, endpoint)):
-                if one.planned.unique is strict:
-                    raise ConnectError(
-                        f"publisher {one.name!r} must have a network flow for itself "
-                        f"(strictly_required), and would share it with publisher {two.name!r}",
-                        hint="give each a connection of its own",
-                    )
+        there = [e for e in self.endpoints.values() if e is endpoint or e.connection is connection]
+        there = [each for each in there if each.kind is EndpointKind.PUBLISHER]
+        strict = UniqueRequirement.STRICTLY_REQUIRED
+        alone = next((each for each in there if each.planned.unique is strict), None)
+        if alone is not None and (len(there) > 1 or connection.participant is None):
+            raise ConnectError(
+                f"publisher {alone.name!r} must have a network flow for itself "
+                "(strictly_required), and would share one",
+                hint="give it a connection of its own",
+            )
 
 
 def _peers(endpoint: Endpoint) -> int:
@@ -520,15 +497,3 @@ def _done() -> Future:
     done: Future = Future()
     done.set_result(None)
     return done
-
-
-def _refuse_other(planned: PlannedEndpoint, before: PlannedEndpoint) -> None:
-    """Raise unless an endpoint is declared again as it was, by a manifest or by the same line."""
-    at = planned.at
-    again = (before.at.file, before.at.line) == (at.file, at.line)
-    if before.type != planned.type or not (before.at.path or again):
-        raise LifecycleError(
-            f"{at.file}:{at.line}: cannot declare {planned.name!r} in {planned.kind.value} "
-            f"as {planned.type}: {before.at.file}:{before.at.line} declares it as {before.type} "
-            "already"
-        )

@@ -22,10 +22,9 @@ from rclpy.event_handler import (
 )
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import qos_profile_system_default
 from rclpy.task import Future
 
-from lifecycle.errors import LifecycleError, nearest
+from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import create_subscription
@@ -33,7 +32,7 @@ from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.node.callbacks import Goals, called, resolve_action_name
 from lifecycle.node.connections import Connection
 from lifecycle.node.gate import GatedSubscription
-from lifecycle.node.handlers import Key
+from lifecycle.node.handlers import Key, alternatives
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
@@ -70,12 +69,7 @@ def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
         )
     hint = "endpoints are declared at configure; ask from on_configure on"
     if by_spelling:
-        # A word is nearest to one of its own kind: `vidoe` to `video`, with a kind to all of it.
-        words = {name: each for each, (_, name) in by_spelling.items()}
-        words |= {each: each for each in by_spelling}
-        near = words.get(nearest(spelling, words), "")
-        listed = ", ".join(map(repr, by_spelling))
-        hint = (f"did you mean {near!r}? " if near else "") + f"declared: {listed}"
+        hint = alternatives(spelling, by_spelling)
     raise UnknownEndpointError(f"cannot find endpoint {spelling!r} of {node}", hint=hint)
 
 
@@ -125,22 +119,6 @@ def watch_matches(
         handler.destroy()
 
     return stop
-
-
-def refuse_unfit(kind: EndpointKind, options: Iterable[str]) -> None:
-    """Raise LifecycleError for what endpoints of a kind cannot have."""
-    for name in options:
-        fitting = _FITTING.get(name, (kind,))
-        if kind not in fitting:
-            nouns = ", ".join(f"{each.noun}s" for each in fitting)
-            raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
-
-
-_FITTING = {
-    "raw": (EndpointKind.SUBSCRIPTION,),
-    "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
-    "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
-}
 
 
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
@@ -264,14 +242,8 @@ _DESTROY = {
 
 def make_entity(managed: Managed, endpoint: Endpoint, connection: Connection) -> Any:
     """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
-    kind, introspection = endpoint.kind, endpoint.options.get("introspection")
-    create = _topic_end if kind.is_topic else _served
-    entity = create(managed, endpoint, connection, _name(managed, endpoint, connection))
-    if introspection is not None:
-        entity.configure_introspection(
-            managed.node.get_clock(), qos_profile_system_default, introspection
-        )
-    return entity
+    create = _topic_end if endpoint.kind.is_topic else _served
+    return create(managed, endpoint, connection, _name(managed, endpoint, connection))
 
 
 def unmake(managed: Managed, kind: EndpointKind, entity: Any, connection: Connection) -> None:
@@ -344,7 +316,7 @@ def _served_on(managed: Managed, endpoint: Endpoint, node: Node, *, name: str) -
         )
         managed.gate.add(goals.server, goals)
         return goals.server
-    options: dict[str, Any] = {"callback_group": group}
+    options = {**endpoint.options, "callback_group": group}
     if endpoint.planned.qos is not None:
         options["qos_profile"] = to_rclpy(endpoint.planned.qos)
     if kind is EndpointKind.SERVICE_CLIENT:

@@ -22,7 +22,6 @@ from lifecycle.measure.counter import Counter
 from lifecycle.measure.sample import Measured, Sample
 
 if TYPE_CHECKING:
-    from rclpy.duration import Duration
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
@@ -60,7 +59,6 @@ class NodeGate:
         self.is_open = False
         self.apart: Collection[str] = ()
         self._entities: dict[int, Gated] = {}
-        self._left: dict[str, Counter] = {}  # of subscriptions that are gone, by topic
         self._opened_ns = 0
 
     def add(self, entity: object, gated: Gated) -> None:
@@ -70,10 +68,7 @@ class NodeGate:
 
     def remove(self, entity: object) -> None:
         """Close and forget an entity that is being destroyed."""
-        gone = self._entities.pop(id(entity), None)
-        if isinstance(gone, GatedSubscription) and gone.counter is not None:
-            self._left[gone.topic] = gone.counter
-        if gone is not None:
+        if (gone := self._entities.pop(id(entity), None)) is not None:
             gone.close()
 
     def measure(self, apart: Collection[str]) -> None:
@@ -104,18 +99,9 @@ class NodeGate:
         for gated in tuple(self._entities.values()):
             gated.open()
 
-    def counter(self, topic: str) -> Counter:
-        """Return what is to count a topic: of a subscription made anew, what counted before."""
-        is_apart = topic in self.apart
-        counter = self._left.pop(topic, None)
-        if counter is None or counter.is_apart is not is_apart:
-            counter = Counter(time.monotonic_ns(), time.time_ns(), is_apart=is_apart)
-        return counter
-
     def close(self) -> None:
         """Close every entity; the node is no longer active."""
         self.is_open = False
-        self._left.clear()
         for gated in tuple(self._entities.values()):
             gated.close()
 
@@ -230,7 +216,7 @@ class GatedSubscription:
         if not self._gate.counts:
             self._subscription.callback = self._call
         elif self.counter is None or self.counter.is_apart is not is_apart:
-            self.counter = self._gate.counter(self.topic)
+            self.counter = Counter(time.monotonic_ns(), time.time_ns(), is_apart=is_apart)
             self._subscription.callback = counting(self._call, self.counter)
         if self._kept and self._later is not None:
             self._later(self._deliver)
@@ -333,10 +319,6 @@ def _takes_one(callback: Callable[..., Any]) -> bool:
     return True
 
 
-_SYSTEM_DEFAULT_DEPTH = 1
-"""Fast DDS 2.14's own, for a profile that leaves history to the middleware."""
-
-
 class Kept:
     """The last messages of one publisher, serialized: its TRANSIENT_LOCAL history.
 
@@ -344,12 +326,10 @@ class Kept:
 
     Args:
         depth: how many, > 0; None for all.
-        lifespan_ns: older ones are not worth anything any more; None for ever.
     """
 
-    def __init__(self, depth: int | None, lifespan_ns: int | None = None) -> None:
-        self._samples: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
-        self._lifespan_ns = lifespan_ns
+    def __init__(self, depth: int | None) -> None:
+        self._messages: collections.deque[bytes] = collections.deque(maxlen=depth)
 
     @classmethod
     def of(cls, qos: QosProfile | None) -> Kept | None:
@@ -358,28 +338,23 @@ class Kept:
             return None
         if qos.history is History.KEEP_ALL:
             return None
-        depth = qos.depth if qos.history is History.KEEP_LAST else 0
-        return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
+        # A profile may leave the depth to the middleware: 1 with Fast DDS 2.14.
+        return cls(qos.depth if qos.history is History.KEEP_LAST and qos.depth else 1)
 
     def add(self, msg: Any) -> None:
         """Keep a message, or serialized bytes, as it is now: its author may change it later."""
         from rclpy.serialization import serialize_message
 
-        data = msg if isinstance(msg, bytes) else serialize_message(msg)
-        self._samples.append((time.monotonic_ns(), data))
+        self._messages.append(msg if isinstance(msg, bytes) else serialize_message(msg))
 
     def send_again(self, publisher: Publisher) -> None:
         """Publish what is kept by another publisher."""
-        oldest_ns = 0
-        if self._lifespan_ns:
-            oldest_ns = time.monotonic_ns() - self._lifespan_ns
-        for said_ns, data in self._samples:
-            if said_ns >= oldest_ns:
-                publisher.publish(data)
+        for data in self._messages:
+            publisher.publish(data)
 
     def forget(self) -> None:
         """Nothing was said."""
-        self._samples.clear()
+        self._messages.clear()
 
 
 class DeclaredPublisher:
@@ -427,25 +402,6 @@ class DeclaredPublisher:
     def get_subscription_count(self) -> int:
         """Return how many subscriptions are matched; 0 while not connected."""
         return self._entity.get_subscription_count() if self._entity is not None else 0
-
-    @property
-    def topic_name(self) -> str:
-        """Fully qualified; empty while not connected."""
-        return str(self._entity.topic_name) if self._entity is not None else ""
-
-    def assert_liveliness(self) -> None:
-        """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""
-        if self._entity is not None:
-            self._entity.assert_liveliness()
-
-    def wait_for_all_acked(self, timeout: Duration | None = None) -> bool:
-        """Return whether all that was published is acknowledged, at the latest after `timeout`.
-
-        It blocks; None waits for ever. Nothing is awaited while not connected.
-        """
-        if self._entity is None:
-            return True
-        return bool(self._entity.wait_for_all_acked(*(() if timeout is None else (timeout,))))
 
     def attach(self, entity: Publisher) -> None:
         """Publish by `entity` from now on; it is another one than before."""

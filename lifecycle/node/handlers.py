@@ -183,38 +183,32 @@ def match(
     methods: dict[Key, str] = {}
     deciders: dict[Key, str] = {}
     timers: list[tuple[Callable[..., Any], float]] = []
-    unused: list[Key] = []
     problems: list[str] = []
     for method, mark in _marks(type(node)):
         if mark.kind is None:
             timers.append((getattr(node, method), mark.period_s))
             continue
         key, taken = (mark.kind, mark.name), deciders if mark.decides else methods
-        noun, decorator = mark.kind.noun, _DECORATORS[mark.kind]
+        decorator = "@on_goal" if mark.decides else _DECORATORS[mark.kind]
         if key not in wanted:
-            decorator = "@on_goal" if mark.decides else decorator
             declared = [each for kind, each in wanted if kind is mark.kind]
             problems.append(
-                f"cannot use handler {class_}.{method}: {decorator}({mark.name!r}) "
-                f"names no {noun} that {name} declares; {alternatives(mark.name, declared)}"
+                f"cannot use handler {class_}.{method}: {decorator}({mark.name!r}) names no "
+                f"{mark.kind.noun} that {name} declares; {alternatives(mark.name, declared)}"
             )
-            unused += [] if mark.decides else [key]
         elif key in taken:
-            what = f"decide on goals of {noun}" if mark.decides else f"handle {noun}"
             problems.append(
-                f"cannot {what} {mark.name!r} of {name} twice: "
-                f"{class_}.{taken[key]} and {class_}.{method}"
+                f"cannot use both handlers {class_}.{taken[key]} and {class_}.{method}: "
+                f"{decorator}({mark.name!r})"
             )
         else:
             taken[key] = method
-    for kind, each in (key for key in wanted if key not in methods):
-        decorator = _DECORATORS[kind]
-        near = nearest(each, [other for of, other in unused if of is kind])
-        hint = f"; did you mean it where {decorator}({near!r}) stands?" if near else ""
-        problems.append(
-            f"cannot serve {kind.noun} {each!r} of {name}: no method of {class_} is "
-            f"decorated with {decorator}({each!r}){hint}"
-        )
+    problems += [
+        f"cannot serve {kind.noun} {each!r} of {name}: no method of {class_} is decorated with "
+        f"{_DECORATORS[kind]}({each!r})"
+        for kind, each in wanted
+        if (kind, each) not in methods
+    ]
     if problems:
         raise LifecycleError("\n".join(problems))
     handlers = {key: getattr(node, method) for key, method in methods.items()}

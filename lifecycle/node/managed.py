@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
     from lifecycle.node.gate import Later
 
 
+_UNSAID = ("undeclare_parameter", "set_descriptor")
+"""They change the parameters of a node, and rclpy notifies nobody."""
+
+
 class NodeInHost:
     """What a process knows of one of its nodes, whatever class it is of.
 
@@ -53,6 +58,7 @@ class NodeInHost:
         listeners: are called with it after every change of state, whatever caused it.
         configuration_changes: notifies of each change of its configuration.
         found: endpoints that its code made with rclpy's factories, by id of their object.
+        is_destroyed: its own code has destroyed it, in a process that goes on.
     """
 
     def __init__(
@@ -73,9 +79,23 @@ class NodeInHost:
         self.listeners: list[Callable[[Any], None]] = []
         self.log = node.get_logger()
         self.configuration_changes = ConfigurationChanges(later, collect, failed=self.log.error)
-        changed = self.configuration_changes.touch
-        node.add_post_set_parameters_callback(lambda _: changed())
+        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
+        for name in _UNSAID:
+            self._touch_after(name)
         self.found: dict[int, Endpoint] = {}
+        self.is_destroyed = False
+
+    def _touch_after(self, name: str) -> None:
+        """Have a method of the node followed by a look at its configuration."""
+        method = getattr(self.node, name)
+
+        @functools.wraps(method)
+        def touching(*arguments: Any, **options: Any) -> Any:
+            result = method(*arguments, **options)
+            self.configuration_changes.touch()
+            return result
+
+        setattr(self.node, name, touching)
 
     def add(self, kind: EndpointKind, placement: Placement) -> Endpoint:
         """Note an endpoint that one of rclpy's factories returned."""
@@ -127,7 +147,6 @@ class Managed(NodeInHost):
         auto: bool,
         supervisor: str = "",
         *,
-        served: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
         self.turns = Turns(node)
@@ -135,15 +154,13 @@ class Managed(NodeInHost):
         self.auto = auto
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
-        self._publish: Callable[[Transition], None] = lambda _: None
         self._health = None if health is None else HealthCheck(self, health)
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self._machine = Machine(self, spec.timeouts)
-        if served:
-            self._publish = services.serve(node, self._machine, self.turns.group)
-            configuration.serve(node, self.get_configuration, self.turns.group)
-            serve_interface(node, acts_of(self.data_layer), self.turns.group)
+        self._publish = services.serve(node, self._machine, self.turns.group)
+        configuration.serve(node, self.get_configuration, self.turns.group)
+        serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
             self._join()
 

@@ -7,7 +7,6 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rcl_interfaces.msg import ParameterDescriptor, ParameterValue
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -43,7 +42,6 @@ from lifecycle.node.machine import NodeState
 from lifecycle.node.managed import Managed
 from lifecycle.node.planned import (
     Construction,
-    calling_position,
     default_name,
     is_auto,
     plan_without_manifest,
@@ -54,8 +52,6 @@ from lifecycle.verify.outcome import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
-    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-    from rclpy.service_introspection import ServiceIntrospectionState
 
     from lifecycle.graph.state import GraphEvent
 
@@ -118,8 +114,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             itself as soon as it is spun. Under a supervisor or `lifecycle run` theirs wins.
         namespace: as in rclpy; a manifest's wins.
         context: as in rclpy.
-        enable_communication_interface: serve and announce its states; without, no other process
-            can drive it or read its configuration.
         options: further keywords of rclpy.node.Node.
 
     Attributes:
@@ -140,15 +134,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         lifecycle: str = "manual",
         namespace: str | None = None,
         context: Context | None = None,
-        enable_communication_interface: bool = True,
         **options: Any,
     ) -> None:
         auto = is_auto(lifecycle)
-        if not isinstance(enable_communication_interface, bool):
-            raise TypeError(
-                f"cannot use enable_communication_interface={enable_communication_interface!r}; "
-                "allowed: True, False"
-            )
         name = node_name or default_name(type(self))
         super().__init__(name, namespace=namespace, context=context, **options)
         by_host = self._construction
@@ -161,7 +149,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             spec,
             auto,
             by_host.supervisor if by_host is not None else "",
-            served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
         self._gate = self.lifecycle.gate
@@ -218,22 +205,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         self.lifecycle.turns.call_after(seconds, lambda: future.set_result(None))
         return future
 
-    def undeclare_parameter(self, name: str) -> None:
-        """As rclpy's, which notifies nothing; the node's configuration has changed."""
-        super().undeclare_parameter(name)
-        self.lifecycle.configuration_changes.touch()
-
-    def set_descriptor(
-        self,
-        name: str,
-        descriptor: ParameterDescriptor,
-        alternative_value: ParameterValue | None = None,
-    ) -> ParameterValue:
-        """As rclpy's, which notifies nothing; the node's configuration has changed."""
-        value = super().set_descriptor(name, descriptor, alternative_value)
-        self.lifecycle.configuration_changes.touch()
-        return value
-
     def destroy_node(self) -> None:
         """As rclpy's; participants of its own go with it."""
         self.lifecycle.close()
@@ -289,9 +260,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         name: str,
         msg_type: type[Any],
         qos: QosProfile | QoSProfile | int = 10,
-        *,
-        lossy: bool | None = None,
-        size_bytes: int | None = None,
     ) -> None:
         """Declare a publisher; `self.publisher(name)` is its handle from on_configure on.
 
@@ -299,14 +267,11 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             name: relative, absolute or private.
             msg_type: its class.
             qos: a number is a history depth.
-            lossy: hint for negotiation: the data bear an unreliable transport.
-            size_bytes: hint for negotiation: the largest serialized message, > 0.
 
         Raises:
             LifecycleError: declared already, or not allowed (any more).
         """
-        hints = (lossy, size_bytes)
-        self._declare(EndpointKind.PUBLISHER, name, msg_type, qos, hints=hints)
+        self._declare(EndpointKind.PUBLISHER, name, msg_type, qos)
 
     def declare_subscription(
         self,
@@ -315,18 +280,13 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         qos: QosProfile | QoSProfile | int = 10,
         *,
         callback: Callable[..., Any] | None = None,
-        lossy: bool | None = None,
-        size_bytes: int | None = None,
     ) -> None:
         """Declare a subscription; a method decorated with `@on_message(name)` receives it.
 
         One that is declared after configure needs its `callback` given here. Otherwise as
         `declare_publisher`.
         """
-        hints = (lossy, size_bytes)
-        self._declare(
-            EndpointKind.SUBSCRIPTION, name, msg_type, qos, callback=callback, hints=hints
-        )
+        self._declare(EndpointKind.SUBSCRIPTION, name, msg_type, qos, callback=callback)
 
     def declare_service(
         self, name: str, srv_type: type[Any], *, callback: Callable[..., Any] | None = None
@@ -377,40 +337,23 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             lossy: the data bear an unreliable transport.
             size_bytes: the largest serialized message, > 0.
         """
-        data_layer = self.lifecycle.data_layer
-        data_layer.hint(data_layer.find(endpoint), lossy, size_bytes)
+        found = self.lifecycle.data_layer.find(endpoint)
+        found.lossy, found.size_bytes = lossy, size_bytes
+        self.lifecycle.configuration_changes.touch()
 
-    def set_options(
-        self,
-        endpoint: str,
-        *,
-        callback_group: CallbackGroup | None = None,
-        event_callbacks: PublisherEventCallbacks | SubscriptionEventCallbacks | None = None,
-        raw: bool = False,
-        introspection: ServiceIntrospectionState | None = None,
-    ) -> None:
-        """Say how a declared endpoint is made, as the arguments of rclpy's factories do.
+    def set_options(self, endpoint: str, **options: Any) -> None:
+        """Say how a declared endpoint is made, by further keywords of rclpy's factory of its kind.
 
-        In `__init__` or on_configure; it holds each time that the endpoint is made.
+        In `__init__` or on_configure; they hold each time that it is made: `callback_group`,
+        `event_callbacks`, `raw`. What it cannot have is a TypeError at connect.
 
         Args:
             endpoint: `video`, or `publishers/video` where another kind has the name too.
-            callback_group: of its callback and its events.
-            event_callbacks: of a publisher or subscription: deadline, liveliness, incompatible QoS,
-                matched, …
-            raw: a subscription's handler is given serialized bytes instead of a message.
-            introspection: of a service server or client: what it publishes of each call.
+            options: handed on as they are.
 
         Raises:
-            LifecycleError: its kind cannot have one of them, or it exists already.
+            LifecycleError: it exists already.
         """
-        given = {
-            "callback_group": callback_group,
-            "event_callbacks": event_callbacks,
-            "raw": raw,
-            "introspection": introspection,
-        }
-        options = {name: value for name, value in given.items() if value not in (None, False)}
         self.lifecycle.data_layer.set_options(endpoint, options)
 
     def _declare(
@@ -421,7 +364,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         qos: QosProfile | QoSProfile | int | None = None,
         *,
         callback: Callable[..., Any] | None = None,
-        hints: tuple[bool | None, int | None] = (None, None),
     ) -> None:
         if isinstance(qos, int):
             qos = QosProfile(depth=qos)
@@ -431,19 +373,18 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             resolved=resolve_name(self, kind, name),
             type=interface_name(interface),
             qos=from_rclpy(qos) if isinstance(qos, QoSProfile) else qos,
-            at=calling_position(depth=2),
+            at=self.lifecycle.spec.at,
         )
-        data_layer = self.lifecycle.data_layer
-        data_layer.hint(data_layer.declare(planned, callback), *hints)
+        self.lifecycle.data_layer.declare(planned, callback)
 
     # The node interface, in callbacks from on_configure to cleanup.
 
-    def connect_to(self, *urls: str | ConnectionUrl, name: str = "") -> Connection:
+    def connect_to(self, *urls: str | ConnectionUrl, name: str) -> Connection:
         """Make a connection that endpoints can be mapped onto: a DDS participant of its own.
 
         Args:
             urls: its transports, `udpv4://10.77.0.1:7911?peer=10.77.0.2:7910`; at least one.
-            name: letters, digits and underscores; empty makes one up.
+            name: letters, digits and underscores.
 
         Returns:
             The connection; the present one if it has these URLs.

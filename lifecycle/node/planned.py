@@ -11,7 +11,6 @@ import copy
 import functools
 import importlib
 import importlib.util
-import inspect
 import os
 import re
 import sys
@@ -63,16 +62,6 @@ def is_auto(word: str) -> bool:
 def default_name(node_class: type) -> str:
     """Return a node name for a class: `FrontCamera` → `front_camera`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node_class.__name__).lower()
-
-
-def calling_position(*, depth: int) -> Position:
-    """Return the file and line `depth` calls above this function's caller."""
-    frame = inspect.currentframe()
-    for _ in range(depth + 1):
-        frame = frame.f_back if frame is not None else None
-    if frame is None:
-        return Position(file="<code>", line=1, column=1)
-    return Position(file=frame.f_code.co_filename, line=frame.f_lineno, column=1)
 
 
 def plan_without_manifest(node_class: type, *, name: str, namespace: str) -> PlannedNode:
@@ -137,15 +126,10 @@ def load_nodes(reference: str, folders: Iterable[str] = ()) -> Callable[..., Any
     if callable(found) and not isinstance(found, type):
         function: Callable[..., Any] = found
         return function
-    nodes = [
-        each
-        for each, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Node)
-    ]
     what = "has no" if found is None else "has, but not as a node class or a function,"
     raise BringUpError(
         f"cannot use {reference!r}: {module_name} {what} {name!r}",
-        hint=did_you_mean(name, nodes) or f"node classes there: {nodes or 'none'}",
+        hint=did_you_mean(name, vars(module)),
     )
 
 

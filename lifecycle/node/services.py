@@ -190,15 +190,13 @@ def acts_of(data_layer: DataLayer) -> Acts:
     """Return what the services of one of our nodes do."""
 
     def connect_to(asked: Parameter) -> None:
-        data_layer.connect_to(asked.name, connections_of(_texts(asked, "a URL or several")))
+        data_layer.connect_to(asked.name, connections_of(_texts(asked)))
 
     return {
         "connect_to": connect_to,
-        "map_to": lambda asked: data_layer.map_to(
-            asked.name, _text(asked, "the connection's name")
-        ),
+        "map_to": lambda asked: data_layer.map_to(asked.name, "".join(_texts(asked))),
         "disconnect": lambda asked: data_layer.disconnect(asked.name),
-        "remap": lambda asked: data_layer.remap(asked.name, _text(asked, "the new name")),
+        "remap": lambda asked: data_layer.remap(asked.name, "".join(_texts(asked))),
     }
 
 
@@ -239,24 +237,13 @@ def _serving(
     return serve
 
 
-def _text(parameter: Parameter, what: str) -> str:
-    (text,) = _texts(parameter, what, several=False)
-    return text
-
-
-def _texts(parameter: Parameter, what: str, *, several: bool = True) -> Sequence[str]:
+def _texts(parameter: Parameter) -> Sequence[str]:
     value: ParameterValue = parameter.value
-    one, many = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_STRING_ARRAY
-    if value.type == one:
+    if value.type == ParameterType.PARAMETER_STRING:
         return (str(value.string_value),)
-    if several and value.type == many:
+    if value.type == ParameterType.PARAMETER_STRING_ARRAY:
         return tuple(value.string_array_value)
-    wanted, hint = f"a string, type {one}", "write {type: 4, string_value: '…'}"
-    if several:
-        wanted = f"a string or an array of strings, type {one} or {many}"
-        hint += " or {type: 9, string_array_value: ['…']}"
     raise LifecycleError(
-        f"cannot use the value given for {parameter.name!r}: {what} is {wanted}, not type "
-        f"{value.type}",
-        hint=hint,
+        f"cannot use the value given for {parameter.name!r}: it is no string, and no strings",
+        hint="write {type: 4, string_value: '…'} or {type: 9, string_array_value: ['…']}",
     )

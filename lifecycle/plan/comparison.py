@@ -153,6 +153,8 @@ def _node(node: PlannedNode) -> dict[str, Any]:
             "non_blocking_send": each.participant in waiting,
             **_numbers(each.quantities),
         }
+    named = ("arguments", "environment", "extra_arguments")  # users choose these keys
+    document["run"] |= {name: to_plain(getattr(node.run, name)) for name in named}
     if folder := written.get("run.working_directory"):
         document["run"]["working_directory"] = folder.written
     return {

@@ -238,18 +238,6 @@ def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
     return hosts
 
 
-class Observers(msgspec.Struct, frozen=True, kw_only=True):
-    """Supervisors' own participants, by host.
-
-    Attributes:
-        connections: as they are on the control plane.
-        with_tcp: as they are if they must also be found by TCP.
-    """
-
-    connections: Mapping[str, ParticipantConnections]
-    with_tcp: Mapping[str, ParticipantConnections]
-
-
 _Slot = tuple[str, str, str]
 """A participant: what it is of ("observer", "process", "extra"), whose, and its own name."""
 
@@ -274,8 +262,14 @@ def is_fixed(discovery: Discovery) -> bool:
     return discovery.mode in (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
+Observers = Mapping[str, ParticipantConnections]
+"""How supervisors' own participants are connected, by host."""
+
+
 def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Observers]:
     """Connect own participants, extra ones without connection, observers and a discovery server.
+
+    Observers are connected as if they must also be found by TCP; see `connect_observers`.
 
     A participant of a declared connection has its URLs already and is left alone, and so are all
     extra ones where endpoints are static: they carry data and become connections (`place_static`).
@@ -294,14 +288,11 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
     # Of an observer: for metatraffic, user data and sending of UDP, and to listen at by TCP.
     ports = {host: pool.take(host, 4) for host in hosts.used}
 
-    def observers(connections: Mapping[str, ParticipantConnections]) -> Observers:
-        with_tcp = {
-            host: _with_tcp(each, host, ports[host][3], hosts) for host, each in connections.items()
-        }
-        return Observers(connections=connections, with_tcp=with_tcp)
-
     if transport is FlowTransport.ANY:
-        return plan, observers(dict.fromkeys(hosts.used, ParticipantConnections()))
+        return plan, {
+            host: _with_tcp(ParticipantConnections(), host, taken[3], hosts)
+            for host, taken in ports.items()
+        }
     (kind,) = transport.media
     planned = discovery.mode is not DiscoveryMode.DYNAMIC and kind.is_network
     extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
@@ -346,8 +337,10 @@ def connect_control(plan: Plan, hosts: Hosts, pool: PortPool) -> tuple[Plan, Obs
         else node
         for node in plan.nodes
     )
-    found = observers({host: connected(("observer", host, "")) for host in hosts.used})
-    return replace(plan, nodes=nodes, server=server), found
+    return replace(plan, nodes=nodes, server=server), {
+        host: _with_tcp(connected(("observer", host, "")), host, taken[3], hosts)
+        for host, taken in ports.items()
+    }
 
 
 _Key = TypeVar("_Key")
@@ -404,9 +397,7 @@ def connect_observers(
         kinds = {each for each in kinds if each.is_tcp}
     # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
-        contact.peer
-        for host, each in observers.with_tcp.items()
-        for contact in contacts_of(host, each.urls)
+        contact.peer for host, each in observers.items() for contact in contacts_of(host, each.urls)
     }
     contacts = [
         contact
@@ -414,18 +405,21 @@ def connect_observers(
         if (not url.multicast or url.transport.is_tcp) and not ours & {*url.peers}
         for contact in contacts_of(host, (str(url),))
     ]
+    control = control_transport(plan.discovery, hosts)
+    by_tcp = control.medium is not None and control.medium.is_tcp
 
     def connected(host: str, base: ParticipantConnections) -> ParticipantConnections:
-        known = {contact.peer for contact in contacts_of(host, base.urls)}
+        found = [url for url in map(parse, base.urls) if by_tcp or not url.transport.is_tcp]
+        own = tuple(map(str, found)) if control is not FlowTransport.ANY else ()
+        known = {contact.peer for contact in contacts_of(host, own)}
         wanted = [each for each in contacts if each.peer not in known]
-        found = _base_urls(base)
         needed = kinds - {url.transport.unicast for url in found if url.transport.is_network}
         if any(each.is_tcp for each in needed):
-            found = [parse(text) for text in observers.with_tcp[host].urls]
+            found = [*map(parse, base.urls)]
         found += [ConnectionUrl(transport=kind) for kind in UDP_UNICAST if kind in needed]
         new = [{*peers_by(url.transport, wanted, host=host)} - {*url.peers} for url in found]
-        if not needed and not any(new):
-            return base
+        if plan.server is not None or not (needed or any(new)):
+            return replace(base, urls=own)
         return replace(
             base,
             urls=tuple(
@@ -434,23 +428,15 @@ def connect_observers(
             ),
         )
 
-    found = observers.connections
-    if plan.server is None:  # else it announces everything to them
-        found = {host: connected(host, base) for host, base in found.items()}
+    found = {host: connected(host, base) for host, base in observers.items()}
     return {host: each for host, each in found.items() if each.urls}
-
-
-def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
-    """Return the URLs of an observer; where the RMW chooses, what it would choose."""
-    return [parse(text) for text in base.urls] or [
-        ConnectionUrl(transport=each) for each in RMW_DEFAULT
-    ]
 
 
 def _with_tcp(
     base: ParticipantConnections, host: str, port: int, hosts: Hosts
 ) -> ParticipantConnections:
-    urls = _base_urls(base)
+    # Where the RMW chooses, what it would choose.
+    urls = [*map(parse, base.urls)] or [ConnectionUrl(transport=each) for each in RMW_DEFAULT]
     if not any(each.transport.is_tcp for each in urls):
         # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
         address = LOOPBACK if ":" in host or not (host or hosts.several) else host

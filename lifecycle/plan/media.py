@@ -24,6 +24,7 @@ from types import MappingProxyType
 
 import msgspec
 
+from lifecycle.manifest.diagnostics import Diagnostic, error
 from lifecycle.manifest.model import DiscoveryMode, EndpointKind, FlowTransport, RunKind
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import (
@@ -36,11 +37,16 @@ from lifecycle.network.medium import (
     TRANSPORTS_VARIABLE,
     Medium,
     is_fragmented,
-    max_unfragmented,
 )
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.discovery import Contact, Hosts, contacts_of, is_fixed, ports_of
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFlow, PlannedNode, PlannedParticipant
+from lifecycle.plan.model import (
+    Plan,
+    PlannedEndpoint,
+    PlannedFlow,
+    PlannedNode,
+    PlannedParticipant,
+)
 
 End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""
@@ -117,28 +123,6 @@ class Terms(msgspec.Struct, frozen=True, kw_only=True):
     observers: tuple[Contact, ...] = ()
 
 
-class NegotiatedFlow(msgspec.Struct, frozen=True, kw_only=True, order=True):
-    """What carries one topic from one node to another, or why nothing does.
-
-    Attributes:
-        publisher: key of the publishing party.
-        subscription: key of the subscribing party.
-        medium: as `PlannedFlow.medium`; empty where the RMW decides and it is not known, and where
-            nothing carries it.
-        reason: one phrase for people.
-        problem: why it cannot be carried, a sentence; empty if it can.
-        hint: what may help.
-    """
-
-    topic: str
-    publisher: str
-    subscription: str
-    medium: str = ""
-    reason: str = ""
-    problem: str = ""
-    hint: str = ""
-
-
 class NegotiatedConnection(msgspec.Struct, frozen=True, kw_only=True):
     """One connection that a node must have because its own participant does not do it.
 
@@ -157,12 +141,22 @@ class NegotiatedConnection(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that was negotiated; sorted throughout. `problems` are what nothing carries."""
+class Unconnectable(msgspec.Struct, frozen=True, kw_only=True):
+    """What nothing carries, and why, at its publisher."""
 
-    flows: tuple[NegotiatedFlow, ...] = ()
+    flow: PlannedFlow
+    why: Diagnostic
+
+
+Choice = PlannedFlow | Unconnectable
+
+
+class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that was negotiated; sorted throughout."""
+
+    flows: tuple[PlannedFlow, ...] = ()
     connections: tuple[NegotiatedConnection, ...] = ()
-    problems: tuple[NegotiatedFlow, ...] = ()
+    problems: tuple[Unconnectable, ...] = ()
 
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
@@ -315,26 +309,22 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
                 return wish, who
         return FlowTransport.ANY, ""
 
-    def by(self, medium: str, reason: str) -> NegotiatedFlow:
+    def by(self, medium: str, reason: str) -> PlannedFlow:
         """Return the flow between the two by this medium."""
-        return NegotiatedFlow(
+        return PlannedFlow(
             topic=self.writer.resolved,
             publisher=self.publisher.key,
             subscription=self.subscription.key,
             medium=medium,
-            reason=reason,
+            medium_reason=reason,
         )
 
-    def problem(self, how: str, why: str, hint: str = "") -> NegotiatedFlow:
+    def problem(self, how: str, why: str, hint: str = "") -> Unconnectable:
         """Return that nothing carries the flow `how` it was asked for, ` by tcpv4`, and why."""
-        one, other = self.publisher.key, self.subscription.key
-        return NegotiatedFlow(
-            topic=self.writer.resolved,
-            publisher=one,
-            subscription=other,
-            problem=f"cannot carry {self.writer.resolved!r} from {one!r} to {other!r}{how}: {why}",
-            hint=hint,
-        )
+        ends = f"from {self.publisher.key!r} to {self.subscription.key!r}"
+        message = f"cannot carry {self.writer.resolved!r} {ends}{how}: {why}"
+        why_not = error("plan.unconnectable", self.writer.at, message, hint)
+        return Unconnectable(flow=self.by("", ""), why=why_not)
 
 
 MEETING = Medium.SHM
@@ -390,7 +380,7 @@ def _unicast(transports: Collection[str], *, same_host: bool) -> set[Medium]:
 
 def choose(
     pair: Pair, *, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
-) -> NegotiatedFlow:
+) -> Choice:
     """Return what carries a pair.
 
     Args:
@@ -417,6 +407,8 @@ def choose(
         choice = _near(pair, listeners)
     else:
         choice = _far(pair, by_multicast=by_multicast, max_datagram_bytes=max_datagram_bytes)
+    if isinstance(choice, Unconnectable):
+        return choice
     other = pair.reader.transport
     if pair.link is FlowTransport.ANY and choice.medium and not other.accepts(choice.medium):
         return pair.problem(
@@ -432,7 +424,7 @@ def _list(words: Iterable[str]) -> str:
     return ", ".join(words) or "none"
 
 
-def _none_common(pair: Pair, how: str = "") -> NegotiatedFlow:
+def _none_common(pair: Pair, how: str = "") -> Unconnectable:
     one, other = pair.publisher, pair.subscription
     hint = (
         f"shared memory does not leave a host, and an IP transport needs addresses of its version: "
@@ -450,7 +442,7 @@ def _able(party: Party) -> tuple[str, ...]:
     return party.transports if party.connectable else party.own
 
 
-def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> NegotiatedFlow:
+def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> Choice:
     if wish is FlowTransport.NETWORK:
         default = _default(pair)
         medium = default if default in wish.media else _first_ip(pair)
@@ -488,7 +480,7 @@ def _default(pair: Pair) -> str:
     return present[0] if len(present) == 1 else ""
 
 
-def _near(pair: Pair, listeners: int) -> NegotiatedFlow:
+def _near(pair: Pair, listeners: int) -> Choice:
     """Choose on one host: what is there anyway, shared memory, one datagram for all, unicast."""
     default, common = _default(pair), pair.common
     if default or Medium.SHM in common:
@@ -502,7 +494,7 @@ def _near(pair: Pair, listeners: int) -> NegotiatedFlow:
     return _none_common(pair)
 
 
-def _far(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) -> NegotiatedFlow:
+def _far(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) -> Choice:
     """Choose between hosts: TCP where UDP would not do, what is there anyway, UDP, TCP."""
     default = _default(pair)
     tcp = "multicast stays on its host" if by_multicast else _too_large(pair, max_datagram_bytes)
@@ -523,8 +515,7 @@ def _too_large(pair: Pair, max_datagram_bytes: int | None) -> str:
     Either end can deny that the data bear an unreliable transport.
     """
     size = pair.writer.max_message_size
-    limit = max_datagram_bytes or max_unfragmented(ipv6=":" in pair.publisher.host)
     denied = False in (pair.writer.lossy, pair.reader.lossy)
-    if denied and size is not None and is_fragmented(size, limit):
+    if denied and size is not None and is_fragmented(size, pair.publisher.host, max_datagram_bytes):
         return f"not lossy, and {size} bytes are more than one datagram"
     return ""

@@ -25,15 +25,15 @@ from lifecycle.plan.media import (
     DataLayerGraph,
     End,
     NegotiatedConnection,
-    NegotiatedFlow,
     Pair,
     Party,
     Terms,
+    Unconnectable,
     carried,
     choose,
     discover,
 )
-from lifecycle.plan.model import PlanError, PlannedEndpoint
+from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedFlow
 
 Wishes = Mapping[tuple[str, str, str], FlowTransport]
 """What links demand: (topic, key of the publishing party, key of the subscribing one)."""
@@ -53,18 +53,18 @@ def negotiate(
     and URLs, so that little is made anew.
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
-    chosen = _choices(pairs, terms)
-    carriers = _Carriers(
-        [(pair, flow) for pair, flow in zip(pairs, chosen, strict=True) if flow.medium], terms
-    )
-    flows, problems = carriers.settle()
-    flows += [each for each in chosen if not each.medium and not each.problem]
-    problems += [each for each in chosen if each.problem]
+    chosen, problems = _choices(pairs, terms)
+    carriers = _Carriers([each for each in chosen if each[1].medium], terms)
+    flows = [*carriers.settle(problems), *(flow for _, flow in chosen if not flow.medium)]
     return DataLayerGraph(
-        flows=tuple(sorted(set(flows))),
+        flows=tuple(sorted(dict.fromkeys(flows), key=_ends)),
         connections=connections_of(tuple(carriers.moved()), parties, terms, before=before),
-        problems=tuple(sorted(problems)),
+        problems=tuple(sorted(problems, key=lambda each: _ends(each.flow))),
     )
+
+
+def _ends(flow: PlannedFlow) -> tuple[str, str, str]:
+    return flow.topic, flow.publisher, flow.subscription
 
 
 def _pairs(parties: Sequence[Party], wishes: Wishes) -> Iterator[Pair]:
@@ -89,28 +89,32 @@ def _sorted(party: Party, kind: EndpointKind) -> list[PlannedEndpoint]:
     return sorted(found, key=lambda each: (each.resolved, each.name))
 
 
-def _choices(pairs: Sequence[Pair], terms: Terms) -> list[NegotiatedFlow]:
+def _choices(
+    pairs: Sequence[Pair], terms: Terms
+) -> tuple[list[tuple[Pair, PlannedFlow]], list[Unconnectable]]:
     """Choose on each host first: whether a publisher uses a group decides what others can have."""
     listeners: dict[End, set[str]] = {}
     for pair in pairs:
         if pair.same_host and not pair.same_process:
             listeners.setdefault(pair.ends[0], set()).add(pair.subscription.process)
     by_group: set[End] = set()
-    found: dict[int, NegotiatedFlow] = {}
-    for near in (True, False):
-        for index, pair in enumerate(pairs):
-            if pair.same_host is not near:
-                continue
-            writer = pair.ends[0]
-            found[index] = choose(
-                pair,
-                by_multicast=writer in by_group,
-                listeners=len(listeners.get(writer, ())),
-                max_datagram_bytes=terms.max_datagram_bytes,
-            )
-            if found[index].medium == Medium.UDPM:
-                by_group.add(writer)
-    return [found[index] for index in range(len(pairs))]
+    found: dict[int, tuple[Pair, PlannedFlow]] = {}
+    problems: list[Unconnectable] = []
+    for index, pair in sorted(enumerate(pairs), key=lambda each: not each[1].same_host):
+        writer = pair.ends[0]
+        flow = choose(
+            pair,
+            by_multicast=writer in by_group,
+            listeners=len(listeners.get(writer, ())),
+            max_datagram_bytes=terms.max_datagram_bytes,
+        )
+        if isinstance(flow, Unconnectable):
+            problems.append(flow)
+            continue
+        found[index] = pair, flow
+        if flow.medium == Medium.UDPM:
+            by_group.add(writer)
+    return [found[index] for index in sorted(found)], problems
 
 
 _INTRODUCING = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
@@ -126,7 +130,7 @@ class _Carriers:
     first, then the subscription. What moves takes all its media along.
     """
 
-    def __init__(self, chosen: Sequence[tuple[Pair, NegotiatedFlow]], terms: Terms) -> None:
+    def __init__(self, chosen: Sequence[tuple[Pair, PlannedFlow]], terms: Terms) -> None:
         self._fixed = terms.fixed
         self._served = terms.server is not None
         self._chosen = chosen
@@ -143,13 +147,13 @@ class _Carriers:
                     () if flow.medium == Medium.INTRAPROCESS else (token,)
                 )
 
-    def settle(self) -> tuple[list[NegotiatedFlow], list[NegotiatedFlow]]:
-        """Move endpoints until every pair has its medium; return flows, and what has it not."""
+    def settle(self, problems: list[Unconnectable]) -> list[PlannedFlow]:
+        """Move endpoints until every pair has its medium; return flows, and add what has it not."""
         # A pair that held may not do so any more after others have moved.
         changed = 1
         while changed:
             changed = sum(self._move(*each) for each in self._chosen if not self._holds(*each))
-        flows, problems = [], []
+        flows = []
         for pair, flow in self._chosen:
             flows.append(flow)
             impossible = any(map(self._is_impossible, pair.ends))
@@ -167,7 +171,7 @@ class _Carriers:
                 problems.append(pair.problem(f" by {flow.medium}", why, _ONE_TRANSPORT))
             else:
                 problems.append(self._conflict(pair, flow))
-        return flows, problems
+        return flows
 
     def moved(self) -> Iterator[Moved]:
         """Yield the endpoints that have moved, with those whom each connection must find."""
@@ -199,7 +203,7 @@ class _Carriers:
         writer, reader = map(self._transports, pair.ends)
         return carried(writer, reader, same_host=pair.same_host)
 
-    def _holds(self, pair: Pair, flow: NegotiatedFlow) -> bool:
+    def _holds(self, pair: Pair, flow: PlannedFlow) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
         if flow.medium == Medium.INTRAPROCESS:
@@ -207,7 +211,7 @@ class _Carriers:
         meet = self._served or not pair.same_host or discover(*map(self._transports, pair.ends))
         return present == [flow.medium] and meet
 
-    def _move(self, pair: Pair, flow: NegotiatedFlow) -> bool:
+    def _move(self, pair: Pair, flow: PlannedFlow) -> bool:
         if self._present(pair) == [flow.medium] and self._introduce(pair):
             return True
         for end in pair.ends:
@@ -235,7 +239,7 @@ class _Carriers:
                 return True
         return False
 
-    def _conflict(self, pair: Pair, flow: NegotiatedFlow) -> NegotiatedFlow:
+    def _conflict(self, pair: Pair, flow: PlannedFlow) -> Unconnectable:
         present = self._present(pair)
         one, other = (", ".join(sorted(self._transports(end))) or "none" for end in pair.ends)
         happens = "it would not arrive"

@@ -18,7 +18,6 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     DiscoveryRange,
-    EndpointKind,
     Node,
     ParameterValue,
     RosArguments,
@@ -30,11 +29,9 @@ from lifecycle.network.ports import (
     LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
-    EphemeralRange,
     describe_domains,
     max_participants,
     safe_domains,
-    unique_flow_ports,
 )
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
 
@@ -228,9 +225,6 @@ def _redacted(run: Run) -> Run:
     )
 
 
-_NO_EPHEMERAL = EphemeralRange(first=1, last=1)
-"""Asks for the limits that hold whatever an operating system does with its ports."""
-
 _OTHER_MEANS = (
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -259,7 +253,8 @@ def overcrowded(plan: Plan, environment: Mapping[str, str]) -> Iterator[Diagnost
         at = plan.positions.get("discovery", nodes[0].at)
         where = f"on {' and '.join(dict.fromkeys(repr(node.machine) for node in nodes))}"
         participants = _participants(nodes)
-        for make, ephemeral in ((error, _NO_EPHEMERAL), (note, LINUX)):
+        # What holds whatever an operating system does with its ports, then Linux's default.
+        for make, ephemeral in ((error, range(0)), (note, LINUX)):
             room = max_participants(plan.domain_id, ephemeral)
             if participants > room.participants:
                 message = (
@@ -270,19 +265,6 @@ def overcrowded(plan: Plan, environment: Mapping[str, str]) -> Iterator[Diagnost
                 hint = f"use a domain of {safe}, fewer processes, or fewer unique publishers"
                 yield make("check.ports", at, message, hint)
                 break
-        ports = unique_flow_ports()
-        subscriptions = sum(
-            each.unique.asks and each.kind is EndpointKind.SUBSCRIPTION
-            for node in nodes
-            for each in node.endpoints
-        )
-        if subscriptions > len(ports) - participants:
-            message = (
-                f"cannot give {subscriptions} subscriptions a port of their own {where}: Fast DDS "
-                f"takes them from {ports[0]}–{ports[-1]}, and one for each of {participants} "
-                "participants"
-            )
-            yield error("check.ports", at, message, "ask for fewer unique subscriptions")
         looking = _participants(
             node
             for node in nodes

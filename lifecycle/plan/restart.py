@@ -66,11 +66,15 @@ def restarted(
     """
     original, current = _listeners(first), _listeners(plan, reported)
     processes = {node.process for node in first.nodes if node.key in keys}
-    again = {
-        place: (host, _on_next_port(first, original, place, current[place]))
-        for place, (host, url) in original.items()
-        if (place[0] in (keys if place[1] else processes)) and _moves(url)
-    }
+    used: dict[str, int] = {}
+    for host, url in current.values():
+        used[host] = max(used.get(host, 0), url.port or 0)
+    again: dict[_Place, _Listener] = {}
+    for place, (host, url) in original.items():
+        if (place[0] in (keys if place[1] else processes)) and _moves(url):
+            lowest = max(used[host] + 1, first.discovery.first_port + RESTART_PORTS_FROM)
+            (used[host],) = PortPool(lowest, terms_of(first).taken).take(host)
+            again[place] = (host, replace(current[place][1], port=used[host]))
     reached = {place: _peer(each) for place, each in {**current, **again}.items()}
     urls = {}
     for place, (_, url) in again.items():
@@ -156,25 +160,6 @@ def _listeners(plan: Plan, reported: Reported = _NOTHING) -> dict[_Place, _Liste
             urls = said.get(each.connection) or each.connections.urls
             listen((node.key, each.name), node.machine, urls)
     return found
-
-
-def _on_next_port(
-    first: Plan, original: Mapping[_Place, _Listener], place: _Place, now: _Listener
-) -> ConnectionUrl:
-    """Return the participant's URL on the next port of its own.
-
-    Every participant of a host has one port of each round, whichever restarts it: supervisors that
-    share a host need not ask each other.
-    """
-    host, url = now
-    listeners = [each for each, (other, _) in original.items() if each[0] and other == host]
-    pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, terms_of(first).taken)
-    mine, had = listeners.index(place), url.port or 0
-    port = pool.take(host, len(listeners))[mine]
-    if had != original[place][1].port:
-        while port <= had:
-            port = pool.take(host, len(listeners))[mine]
-    return replace(url, port=port)
 
 
 def _peers(

@@ -18,7 +18,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, error
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -143,15 +143,11 @@ def _groups(node: Node, needs: FlowNeeds) -> list[list[ResolvedNeed]]:
     return list(found.values())
 
 
-def _asked(
-    needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant],
-    marks: Sequence[int | None] = (),
-) -> dict[str, Any]:
+def _asked(needs: Sequence[ResolvedNeed] | Sequence[PlannedParticipant]) -> dict[str, Any]:
     """Return what a participant must do for all that it carries; it can have one mark."""
-    dscps = (*marks, *(each.dscp for each in needs))
     sizes = [each.max_datagram_bytes for each in needs if each.max_datagram_bytes is not None]
     return {
-        "dscp": next((each for each in dscps if each is not None), None),
+        "dscp": next((each.dscp for each in needs if each.dscp is not None), None),
         "max_datagram_bytes": min(sizes, default=None),
         "non_blocking_send": any(each.non_blocking_send for each in needs),
     }
@@ -173,7 +169,7 @@ def _connection(
         connection=connection.name,
         connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
         declared=True,
-        **_asked(needs, [url.dscp for url in connection.urls]),
+        **_asked(needs),
     )
 
 
@@ -262,7 +258,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     plan = replace(
         plan,
         nodes=nodes,
-        observers=_by_machine(own.with_tcp, hosts),
+        observers=_by_machine(own, hosts),
     )
     variables = dict(variables_of(plan))
     parties = {
@@ -272,7 +268,7 @@ def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     static = data_layer.source is DataLayerSource.STATIC
     if static:
         graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
-        if found := tuple(_unconnectable(graph, plan, links)):
+        if found := tuple(_unconnectable(graph, links)):
             raise ManifestError(found)
         plan = with_graph(plan, graph)
     may_use_tcp = not static and _may_use_tcp(plan)
@@ -288,8 +284,8 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
     negotiated = {(each.topic, each.publisher, each.subscription): each for each in graph.flows}
 
     def with_medium(flow: PlannedFlow) -> PlannedFlow:
-        found = negotiated.get((flow.topic, flow.publisher, flow.subscription))
-        return replace(flow, medium=found.medium, medium_reason=found.reason) if found else flow
+        found = negotiated.get((flow.topic, flow.publisher, flow.subscription), flow)
+        return replace(flow, medium=found.medium, medium_reason=found.medium_reason)
 
     return replace(
         plan,
@@ -320,24 +316,15 @@ def _may_use_tcp(plan: Plan) -> bool:
     return reliable or any(each and (each.is_tcp or each.is_group) for each in wishes)
 
 
-def _unconnectable(
-    graph: DataLayerGraph, plan: Plan, links: Sequence[Link]
-) -> Iterator[Diagnostic]:
+def _unconnectable(graph: DataLayerGraph, links: Sequence[Link]) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
-    start = Position(file=plan.manifest_path, line=1, column=1)
     asked: dict[tuple[str, str, str], Position] = {}
-    for each in links:
-        if each.transport is not FlowTransport.ANY:
-            asked.setdefault((each.topic, each.from_node, each.to_node), each.at)
-    endpoints: dict[tuple[str, str], Position] = {}
-    for node in plan.nodes:
-        for endpoint in node.endpoints:
-            if endpoint.kind is EndpointKind.PUBLISHER:
-                endpoints.setdefault((node.key, endpoint.resolved), endpoint.at)
-    for problem in graph.problems:
-        link = asked.get((problem.topic, problem.publisher, problem.subscription))
-        at = link or endpoints.get((problem.publisher, problem.topic)) or start
-        yield error("plan.unconnectable", at, problem.problem, problem.hint)
+    for link in links:
+        if link.transport is not FlowTransport.ANY:
+            asked.setdefault((link.topic, link.from_node, link.to_node), link.at)
+    for each in graph.problems:
+        ends = (each.flow.topic, each.flow.publisher, each.flow.subscription)
+        yield replace(each.why, at=asked.get(ends, each.why.at))
 
 
 DATA = "data"

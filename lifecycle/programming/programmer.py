@@ -13,8 +13,9 @@ from typing import Any
 
 import psutil
 
+from lifecycle.codec import from_json
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.network.five_qi import dscp_mapping, parse_mapping
+from lifecycle.network.five_qi import DscpMapping, dscp_mapping
 from lifecycle.network.nfe import canonical, is_loopback
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
@@ -58,9 +59,12 @@ def read_program(names: Iterable[str], given: Mapping[str, Any], *, option: str)
         return Program(chosen, Treatment(label_flows=label_flows))
     try:
         file = Path(mapping)
-        found = parse_mapping(file.read_bytes()) if file.is_file() else dscp_mapping(mapping)
+        if file.is_file():
+            found = from_json(file.read_bytes(), DscpMapping)
+        else:
+            found = dscp_mapping(mapping)
     except (OSError, ValueError) as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(f"cannot use {mapping!r} as 5QI to DSCP mapping: {error}") from error
     return Program(chosen, Treatment(mapping=found, label_flows=label_flows))
 
 

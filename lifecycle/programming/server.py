@@ -289,6 +289,8 @@ class ServerTarget(Target):
             if entry is None or not entry.id:
                 kind = ChangeKind.CREATE
                 detail = "" if entry is None else "asked for before, and not answered"
+            elif entry.expires_s is not None and entry.expires_s <= steady_s():
+                detail = "it has expired"
             elif json.loads(entry.body) == each.body:
                 kind = ChangeKind.KEEP
             what = f"{each.rule.describe()}, {each.rule.asks}"

@@ -14,6 +14,7 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Uniqu
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.plan.model import Plan
+from lifecycle.printable import listed
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.network_flows import Uniqueness, effective_transport
 from lifecycle.verify.observation import Observation
@@ -21,16 +22,15 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
 from lifecycle.verify.rules.matching import is_unreported
 from lifecycle.verify.rules.measured import NOT_MEASURED, OF_NUMBERS, measurements
-from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
+from lifecycle.verify.tool_filter import OUR_NODES
 from lifecycle.verify.verdict import (
     Finding,
     FlowReport,
-    OpenEndpoint,
     Stage,
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, View, flow_subject
+from lifecycle.verify.view import Actual, FlowView, View, Whose, flow_subject
 
 _OF_NUMBERS = frozenset(each.id for each in OF_NUMBERS)
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
@@ -155,11 +155,6 @@ def verify(
         blocking=False,
         findings=(),
         flows=flow_reports(view, findings),
-        open_endpoints=tuple(
-            OpenEndpoint(kind=each.kind, node=each.node, name=each.name, type=each.type)
-            for each in view.undeclared
-            if view.planned[each.node].endpoint_policy is EndpointPolicy.OPEN
-        ),
         tolerated=_tolerated(view),
         measured=measurements(view),
     )
@@ -237,39 +232,19 @@ def with_findings(verdict: Verdict, findings: tuple[Finding, ...], policy: Polic
     """
     if not findings:
         return verdict
-    added = with_only(verdict, findings, policy)
-    return replace(
-        added,
-        verdict=Outcome.worst((verdict.verdict, added.verdict)),
-        blocking=verdict.blocking or added.blocking,
-        findings=(*findings, *verdict.findings),
-    )
+    added = with_only(verdict, (*findings, *verdict.findings), policy)
+    worst = Outcome.worst((verdict.verdict, added.verdict))
+    return replace(added, verdict=worst, blocking=verdict.blocking or added.blocking)
 
 
 def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     """List the undeclared nodes that the policy lets be there, sorted by name."""
-    because = {name: f"tolerated_nodes: {pattern}" for name, pattern in view.tools.items()}
-    supervisors = of_supervisors(view.plan, view.of_tools)
-    endpoints = [each for each in view.of_tools if each not in supervisors]
+    tools = {name: pattern for name, pattern in view.tools.items() if pattern != OUR_NODES}
+    because = {name: f"tolerated_nodes: {pattern}" for name, pattern in tools.items()}
     if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
-        others = (*view.foreign, *view.unattributed)
-        undeclared = {name for name in view.observed if name not in view.planned}
-        undeclared |= {each.node for each in others}
-        because |= dict.fromkeys(undeclared, "undeclared_nodes: open")
-        endpoints += others
-    has = {
-        name: tuple(
-            OpenEndpoint(kind=each.kind, node=name, name=each.name, type=each.type)
-            for each in endpoints
-            if each.node == name
-        )
-        for name in because
-    }
-    return tuple(
-        ToleratedNode(node=name, because=because[name], endpoints=has[name])
-        for name in sorted(because)
-        if has[name] or view.tools.get(name) != OUR_NODES
-    )
+        others = {*view.observed, *(each.node for each in view.of(Whose.FOREIGN, Whose.UNKNOWN))}
+        because |= dict.fromkeys(others - view.planned.keys(), "undeclared_nodes: open")
+    return tuple(ToleratedNode(node=name, because=because[name]) for name in sorted(because))
 
 
 def is_trusted(finding: Finding, policy: Policy) -> bool:
@@ -289,72 +264,46 @@ def _blocks(findings: Sequence[Finding], policy: Policy) -> bool:
     )
 
 
-def missing(verdict: Verdict) -> str:
-    """Summarise the findings that keep the gate closed, for the message of a passed deadline.
-
-    Returns:
-        `missing: /robot/camera (node), /robot/video (publisher of /robot/camera)`, then what is
-        there but wrong, `wrong: /robot/base (state.wrong-state)`, then what is not known yet,
-        `unknown: /robot/scan (graph.unattributed-endpoint)`; empty when nothing is waited for.
-    """
-    findings = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
-    if not findings and verdict.blocking:
-        findings = list(verdict.findings)
-    named: dict[str, dict[str, None]] = {"missing": {}, "wrong": {}, "unknown": {}}
-    broken = {each.rule for each in findings}
-    for finding in findings:
-        kind = rule(finding.rule)
-        it = f"{finding.subject} ({finding.rule})"
-        if kind.absence and finding.outcome is Outcome.VIOLATED:
-            what = finding.endpoint.noun if finding.endpoint else ""
-            phrase = kind.absence.format(kind=what, node=finding.node)
-            named["missing"][f"{finding.subject} ({phrase})"] = None
-        elif kind.awaits is not None:
-            # While what would show it is missing, that is what is waited for.
-            if kind.awaits.id not in broken:
-                named["unknown"][it] = None
-        else:
-            is_known = finding.outcome is Outcome.VIOLATED
-            named["wrong" if is_known else "unknown"][it] = None
-    return "; ".join(f"{word}: {', '.join(each)}" for word, each in named.items() if each)
-
-
-def not_ok(verdict: Verdict) -> str:
-    """Summarise what keeps a verdict from being ok, whether it closes the gate or not.
-
-    Returns:
-        As `missing`; where that is empty, `unknown: /robot/video (graph.unattributed-endpoint)`;
-        empty for a verdict that is ok.
-    """
-    subjects = dict.fromkeys(f"{each.subject} ({each.rule})" for each in verdict.findings)
-    return missing(verdict) or (f"unknown: {', '.join(subjects)}" if subjects else "")
-
-
 _NAMED_EACH = 2
 _NAMED_RULES = 4
 _LONGEST = 500
 
 
-def taken_on_trust(verdict: Verdict) -> str:
-    """Summarise what is unverifiable in one bounded line, for a gate that opens in spite of it.
+def summary(findings: Iterable[Finding]) -> str:
+    """Summarise findings in one bounded line, for the message of a deadline or of a gate.
 
     Returns:
-        `max_delay_ms 5 of /robot/video: /camera → /viewer, rate_hz 15 of /robot/video and 3 more
-        (flow.not-measured); /camera (graph.qos-unverifiable)`: by rule, at most two of each; empty
-        if nothing is.
+        `/camera, /viewer and 3 more (graph.missing-node); max_delay_ms 5 of /video: /camera →
+        /viewer (flow.not-measured)`: by rule, at most two of each; empty without any. What is not
+        known while what would show it is missing is not named.
     """
-    by_rule: dict[str, list[str]] = {}
-    for finding in verdict.findings:
-        if finding.outcome is Outcome.UNVERIFIABLE:
-            what = f"{finding.expected} of " if rule(finding.rule).names_expected else ""
-            by_rule.setdefault(finding.rule, []).append(f"{what}{finding.subject}")
-    parts = []
-    for rule_id, found in list(by_rule.items())[:_NAMED_RULES]:
-        subjects = list(dict.fromkeys(found))
-        more = len(subjects) - _NAMED_EACH
-        named = ", ".join(subjects[:_NAMED_EACH])
-        parts.append(named + (f" and {more} more" if more > 0 else "") + f" ({rule_id})")
-    if len(by_rule) > _NAMED_RULES:
-        parts.append(f"and {len(by_rule) - _NAMED_RULES} more rules")
+    by_rule: dict[str, dict[str, None]] = {}
+    for each in findings:
+        what = f"{each.expected} of {each.subject}" if rule(each.rule).numbers else each.subject
+        by_rule.setdefault(each.rule, {})[what] = None
+    awaited = {each: rule(each).awaits for each in by_rule}
+    parts = [
+        f"{listed(list(subjects), _NAMED_EACH)} ({rule_id})"
+        for rule_id, subjects in by_rule.items()
+        if (awaits := awaited[rule_id]) is None or awaits.id not in by_rule
+    ]
+    if len(parts) > _NAMED_RULES:
+        parts[_NAMED_RULES:] = [f"and {len(parts) - _NAMED_RULES} more rules"]
     line = "; ".join(parts)
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
+
+
+def missing(verdict: Verdict) -> str:
+    """Summarise the findings that keep the gate closed; empty when nothing is waited for."""
+    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    return summary(violated or (verdict.findings if verdict.blocking else ()))
+
+
+def not_ok(verdict: Verdict) -> str:
+    """Summarise what keeps a verdict from being ok, whether it closes the gate or not."""
+    return missing(verdict) or summary(verdict.findings)
+
+
+def taken_on_trust(verdict: Verdict) -> str:
+    """Summarise what is unverifiable, for a gate that opens in spite of it."""
+    return summary(each for each in verdict.findings if each.outcome is Outcome.UNVERIFIABLE)

@@ -6,7 +6,7 @@ All rules read the result, so that they agree on what is the same thing. Pure.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -27,7 +27,6 @@ from lifecycle.verify.tool_filter import (
     fold_actions,
     is_noise_endpoint,
     known_node,
-    owners,
     part_type,
     tolerating_pattern,
 )
@@ -37,7 +36,9 @@ from lifecycle.verify.view import (
     FlowView,
     NodeFacts,
     SeenEndpoint,
+    TopicEnds,
     View,
+    Whose,
     actual_qos,
     is_beyond,
     may_hide,
@@ -65,15 +66,15 @@ def lay_out(
     names = DeclaredNames.of(plan)
     reported = _by_identity(observation)
     configurations = {each.name: each for each in reversed(reported)}
-    groups = _attributed(observation, names, reported, configurations)
+    groups, hidden = _attributed(observation, names, reported)
     duplicated = {each.full_name for each in observation.nodes if each.count > 1}
     # Of two of one name, or where an endpoint is not its owner's, one is somebody else's.
-    hidden = owners(planned, reported).keys() - planned.keys() - groups.keys() - duplicated
+    hidden -= planned.keys() | groups.keys() | duplicated
     tools = _tools(observation, groups, planned, hidden, plan.policy.tolerated_nodes)
     observed = _graph_nodes(observation.nodes, planned, hidden, tools)
     parameters = {each.node: each for each in observation.parameters}
     nodes: dict[str, NodeFacts] = {}
-    left_over: list[ObservedEndpoint] = []
+    others: list[SeenEndpoint] = []
     for name, node in planned.items():
         configuration = configurations.get(name)
         matched, rest = _match_node(
@@ -88,10 +89,14 @@ def lay_out(
             absent=name not in observed and all(each.observed is None for each in matched),
         )
         # A second node of the same name has the same endpoints again; that is one finding.
-        left_over += () if name in duplicated else rest
+        whose = Whose.TWIN if name in duplicated else Whose.UNDECLARED
+        others += (SeenEndpoint.of(each, whose) for each in rest)
     actual = tuple(itertools.chain.from_iterable(facts.actual for facts in nodes.values()))
-    strangers = [name for name in groups if name and name not in planned and name not in tools]
-    of_tools = tuple(each for name in groups if name in tools for each in groups[name])
+    for name in groups.keys() - planned.keys():
+        known = Whose.TOOL if name in tools else Whose.FOREIGN
+        others += (SeenEndpoint.of(each, known if name else Whose.UNKNOWN) for each in groups[name])
+    others += (SeenEndpoint.of(each, Whose.DEPARTED) for each in observation.departed)
+    found = _without_halves(others, groups, actual)
     return View(
         plan=plan,
         stage=stage,
@@ -105,17 +110,9 @@ def lay_out(
         configurations=configurations,
         nodes=nodes,
         actual=actual,
-        undeclared=_undeclared(left_over, groups, actual),
-        unattributed=groups.get("", ()),
-        foreign=tuple(each for name in strangers for each in groups[name]),
+        others=found,
+        topics=_topics(actual, found),
         tools=tools,
-        of_tools=of_tools,
-        groups=groups,
-        seen=_seen(groups, actual, tools),
-        seen_of_tools=tuple(map(SeenEndpoint.of, _topical(of_tools))),
-        departed=tuple(
-            replace(SeenEndpoint.of(each), has_ended=True) for each in observation.departed
-        ),
         flows=_flows(plan, nodes, actual),
         uniqueness=Uniqueness(
             reported, {each.full_name: plan.address_of(each.machine) for each in plan.nodes}
@@ -133,73 +130,52 @@ def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
 
 
 def _attributed(
-    observation: Observation,
-    names: DeclaredNames,
-    reported: Iterable[NodeConfiguration],
-    configurations: dict[str, NodeConfiguration],
-) -> dict[str, tuple[ObservedEndpoint, ...]]:
-    """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
+    observation: Observation, names: DeclaredNames, reported: Iterable[NodeConfiguration]
+) -> tuple[dict[str, tuple[ObservedEndpoint, ...]], frozenset[str]]:
+    """Give each endpoint to its node; return them by node name, sorted, and hidden nodes' names.
 
-    Services have no GID of their own in reports: one whose node is not known is that of the node on
-    its participant that declares it. What client libraries bring along is left out here, unless it
-    is declared; under a declared name, unless it is a declared node's. By node name, sorted.
+    A name proves nothing: any process can call a node `_camera_flow_0`. Only the node that has it
+    can say so, and on which participant it is. Where discovery shows no node, the GID that a node
+    reported counts; services have none of their own in reports: one is that of the node on its
+    participant that declares it. What client libraries bring along is left out here, unless it is
+    declared; under a declared name, unless it is a declared node's.
     """
-    hidden = owners(names.nodes, reported)
-    shown: dict[str, list[ObservedEndpoint]] = {}
-    for each in observation.endpoints:
-        shown.setdefault(each.node, []).append(each)
+    by_gid: dict[str, str] = {}
+    by_prefix: dict[str, dict[str, None]] = {}
+    hidden: dict[str, str] = {}
+    for each in reported:
+        gids = {one.gid for one in each.endpoints} | {one.prefix for one in each.connections}
+        for gid in gids - {""}:
+            by_gid.setdefault(gid, each.name)
+            by_prefix.setdefault(gid[:PREFIX_DIGITS], {})[each.name] = None
+        others = {one.node_name for one in each.connections}
+        others |= {one.participant for one in each.endpoints}
+        if each.name in names.nodes:
+            namespace = each.name.rpartition("/")[0]
+            hidden |= {f"{namespace}/{other}": each.name for other in others - {""}}
     by_node: dict[str, list[ObservedEndpoint]] = {}
-    for name, endpoints in shown.items():
-        node = known_node(name)
-        if not node:
-            for each in _unknown(endpoints, names, configurations):
-                by_node.setdefault(each.node, []).append(each)
-            continue
-        owner = hidden.get(node) if node not in names.nodes else None
-        ours = (owner.node if owner is not None else node) in configurations
-        for each in endpoints:
-            whose = owner.node if owner is not None and owner.has(each) else node
-            if names.keeps(each, whose, ours=ours):
-                by_node.setdefault(whose, []).append(_as_of(each, whose))
-    return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
-
-
-def _unknown(
-    endpoints: Iterable[ObservedEndpoint],
-    names: DeclaredNames,
-    configurations: dict[str, NodeConfiguration],
-) -> Iterator[ObservedEndpoint]:
-    """Yield the endpoints whose node discovery does not show, each as of its node."""
-    by_gid = {
-        report.gid: name
-        for name, configuration in configurations.items()
-        for report in configuration.endpoints
-        if report.gid
-    }
-    by_participant: dict[str, list[str]] = {}
-    for prefix, name in dict.fromkeys((gid[:PREFIX_DIGITS], name) for gid, name in by_gid.items()):
-        by_participant.setdefault(prefix, []).append(name)
-    for endpoint in endpoints:
-        node = by_gid.get(endpoint.gid, "")
-        if not node and not endpoint.kind.is_topic:
-            node = next(
-                (
-                    each
-                    for each in by_participant.get(endpoint.gid[:PREFIX_DIGITS], ())
-                    if (each, *(action_part(endpoint.kind, endpoint.name) or _place(endpoint)))
-                    in names.ends
-                ),
-                "",
-            )
-        # Half of a service may be seen before its node is: it is no second one.
-        known = node and not endpoint.kind.is_topic
-        yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
-
-
-def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
-    if node == endpoint.node:
-        return endpoint
-    return replace(endpoint, node=node)
+    ours = {each.name for each in reported}
+    for endpoint in observation.endpoints:
+        node, gid = known_node(endpoint.node), endpoint.gid
+        on = by_prefix.get(gid[:PREFIX_DIGITS], {})
+        if node:
+            owner = hidden.get(node, node) if node not in names.nodes else node
+            whose = owner if not gid or owner in on else node
+            if not names.keeps(endpoint, whose, ours=owner in ours):
+                continue
+        else:
+            whose = by_gid.get(gid, "")
+            if not whose and not endpoint.kind.is_topic:
+                place = action_part(endpoint.kind, endpoint.name) or _place(endpoint)
+                whose = next((each for each in on if (each, *place) in names.ends), "")
+            if whose and not endpoint.kind.is_topic:
+                # Half of a service may be seen before its node is: it is no second one.
+                gid = ""
+        if (whose, gid) != (endpoint.node, endpoint.gid):
+            endpoint = replace(endpoint, node=whose, gid=gid)  # noqa: PLW2901
+        by_node.setdefault(whose, []).append(endpoint)
+    groups = {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
+    return groups, frozenset(hidden)
 
 
 def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
@@ -221,10 +197,6 @@ def _tools(
         if known_node(name) and name not in hidden
     }
     return {name: pattern for name, pattern in found.items() if pattern}
-
-
-def _topical(endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
-    return (each for each in endpoints if each.kind.is_topic)
 
 
 def _match_node(
@@ -324,14 +296,12 @@ def _as_observed(node: PlannedNode, report: EndpointReport) -> ObservedEndpoint:
     )
 
 
-def _undeclared(
-    left_over: Sequence[ObservedEndpoint],
+def _without_halves(
+    others: Iterable[SeenEndpoint],
     groups: Mapping[str, tuple[ObservedEndpoint, ...]],
     actual: Iterable[Actual],
-) -> tuple[ObservedEndpoint, ...]:
-    """Leave out of what no declaration covers the parts of declared actions that are half seen."""
-    if not any(action_part(each.kind, each.name) for each in left_over):
-        return _sorted(left_over)
+) -> tuple[SeenEndpoint, ...]:
+    """Leave out the parts of declared actions that are half seen; sort what is left."""
     seen = {
         (each.node, each.kind, each.name)
         for group in groups.values()
@@ -340,14 +310,36 @@ def _undeclared(
     }
     declared = {(each.node, each.kind, each.name): each.planned.type for each in actual}
 
-    def is_half(endpoint: ObservedEndpoint) -> bool:
+    def is_half(endpoint: SeenEndpoint) -> bool:
         action = action_part(endpoint.kind, endpoint.name)
-        place = (endpoint.node, *action) if action is not None else None
-        if place not in declared or (place in seen and endpoint.gid):
+        if action is None or endpoint.whose is not Whose.UNDECLARED:
+            return False
+        place = (endpoint.node, *action)
+        if place not in declared or (place in seen and _gid(endpoint)):
             return False
         return endpoint.type == part_type(endpoint.name, declared[place])
 
-    return _sorted(each for each in left_over if not is_half(each))
+    return tuple(
+        sorted(
+            (each for each in others if not is_half(each)),
+            key=lambda each: (each.node, each.name, each.kind.value, each.type, _gid(each)),
+        )
+    )
+
+
+def _gid(endpoint: SeenEndpoint) -> str:
+    return "" if endpoint.observed is None else endpoint.observed.gid
+
+
+def _topics(actual: Iterable[Actual], others: Iterable[SeenEndpoint]) -> dict[str, TopicEnds]:
+    """Collect publishers and subscriptions; one beyond reach is counted by what it matches."""
+    found: dict[str, TopicEnds] = {}
+    seen = (each for each in actual if each.observed is not None or each.beyond)
+    for each in itertools.chain(seen, others):
+        if each.kind.is_topic:
+            ends = found.setdefault(each.name, ([], []))
+            ends[each.kind is EndpointKind.SUBSCRIPTION].append(each)
+    return found
 
 
 def _graph_nodes(
@@ -392,32 +384,11 @@ def _actual(
         report=report,
         planned=planned,
         type_hash=type_hash,
-        is_shown=observed is not None or report is not None,
         owner=node,
         observed=observed,
         unseen=unseen,
         beyond=beyond,
     )
-
-
-def _seen(
-    groups: Mapping[str, tuple[ObservedEndpoint, ...]],
-    actual: Sequence[Actual],
-    tools: Collection[str],
-) -> tuple[SeenEndpoint, ...]:
-    """Collect publishers and subscriptions with all that is known of them."""
-    topical = [each for each in actual if each.kind.is_topic]
-    # Not visible here, but the endpoints that match them count them.
-    found: list[SeenEndpoint] = [each for each in topical if each.beyond and each.observed is None]
-    declared = {id(each.observed): each for each in topical if each.observed is not None}
-    found += [
-        declared.get(id(each)) or SeenEndpoint.of(each)
-        for name, group in groups.items()
-        if name not in tools
-        for each in _topical(group)
-    ]
-    found += [each for each in topical if each.unseen and each.observed is not None]
-    return tuple(found)
 
 
 def _flows(

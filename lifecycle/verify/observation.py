@@ -18,7 +18,7 @@ from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue, Readiness
 from lifecycle.manifest.names import topic_of
-from lifecycle.manifest.parameter_values import as_type, misfit, portable
+from lifecycle.manifest.parameter_values import portable
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.measure.clock import ClockOffset
 from lifecycle.measure.sample import Measured
@@ -340,7 +340,7 @@ def shown(
         each
         for each in wanted
         if any((kind, topic_of(node, each.name, kind)) in ends for kind in each.by.kinds)
-        or (not each.by.kinds and _has(parameters.get(each.name), each))
+        or (not each.by.kinds and _is_true(parameters.get(each.name)))
     )
 
 
@@ -361,8 +361,5 @@ def _parameters(node: PlannedNode, seen: Observation) -> Iterator[ParameterRepor
             yield from read.parameters or ()
 
 
-def _has(found: ParameterReport | None, wanted: Readiness) -> bool:
-    if found is None or wanted.value is None:
-        return False
-    value = as_type(wanted.value, found.type)
-    return not misfit(value, found.type) and found.has(portable(value))
+def _is_true(found: ParameterReport | None) -> bool:
+    return found is not None and found.type == "bool" and found.has(True)

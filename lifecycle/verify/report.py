@@ -1,10 +1,8 @@
 """Verification reports of a verdict: text, JUnit XML, SARIF 2.1.0, JSON and GitHub's annotations.
 
-JUnit, for continuous integration: names and number of the cases are always the same, so that
-reports can be compared case by case: one for the manifest, one for each rule, one for the end of
-the run. What refuses the system is a failure. What could not be verified and was allowed is in the
-case's system-out, as flows are in their suite's; a case is skipped only where nothing was judged,
-and then the end of the run fails.
+JUnit, for continuous integration: a case for each finding and one for the end of the run. What
+refuses the system is a failure. What could not be verified and was allowed is in the case's
+system-out, as flows are in their suite's; where nothing was judged, the end of the run fails.
 
 SARIF, for editors and code scanning (OASIS SARIF 2.1.0): violated is an error, unverifiable a
 warning; a finding points at the declaration in the manifest. A run that was no success has at least
@@ -13,14 +11,14 @@ one error; its rule is `run.end` where no finding is to blame. Pure.
 
 from __future__ import annotations
 
-import json
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
+import msgspec
 from msgspec.structs import replace
 
 from lifecycle import codec
-from lifecycle.ci_formats import Case, Json, Problem, Suite, github, junit, sarif
+from lifecycle.ci_formats import Case, Json, Problem, github, junit, sarif
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA
@@ -60,14 +58,8 @@ def render_text(
         findings = [each for each in verdict.findings if each.outcome is outcome]
         for finding in findings:
             lines += ["", *_finding(finding, colour=colour, width=width)]
-    if verdict.open_endpoints:
-        lines += ["", "endpoints that `endpoints: open` allows"]
-        lines += [
-            one_line(f"  {each.kind.noun} of {each.name} in {each.node}, {each.type}")
-            for each in verdict.open_endpoints
-        ]
     if verdict.tolerated:
-        named = ", ".join(each.describe() for each in verdict.tolerated)
+        named = ", ".join(each.name for each in verdict.tolerated)
         lines += ["", *_wrap(named, width, first="tolerated: ")]
     measured = [each for each in verdict.measured if each.bounds]
     if measured:
@@ -96,8 +88,6 @@ def _finding(finding: Finding, *, colour: bool, width: int) -> list[str]:
     lines = [f"{head} {finding.rule}: {one_line(finding.subject)}"]
     rows = [
         ("", finding.message),
-        ("expected", finding.expected),
-        ("observed", finding.observed),
         ("at", finding.at),
         ("to do", finding.hint),
     ]
@@ -148,46 +138,28 @@ _IDS = frozenset(each.id for each in RULES)
 
 
 def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> str:
-    """Write JUnit XML.
+    """Write JUnit XML: a case for each finding, which fails if it refuses the system, and the end.
 
     Args:
-        verdict: gives the results of the cases.
+        verdict: gives the cases.
         plan: None where there is none, because the manifest cannot be used.
         strict: what cannot be verified refuses the system, whatever its policy says.
     """
-
-    def case(classname: str, name: str, found: Sequence[Finding], *, skipped: str = "") -> Case:
-        bad = [each for each in found if _refuses(each, plan, strict=strict)]
-        allowed = [each for each in found if each not in bad]
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-        return Case(
-            classname=classname,
-            name=name,
-            at=next((each.at for each in (*bad, *allowed)), ""),
-            failure=(bad[0].message + more, _described(bad)) if bad else None,
-            note=_described(allowed),
-            skipped="" if found or verdict.judged else skipped,
-        )
-
-    wrong = [each for each in verdict.findings if each.rule not in _IDS]
-    suites = [Suite(name="manifest", cases=[case("manifest", "the manifest is valid", wrong)])]
-    for family in dict.fromkeys(each.family for each in RULES):
-        cases = [
-            case(
-                one.id,
-                one.meaning,
-                [each for each in verdict.findings if each.rule == one.id],
-                skipped="not judged; see the end of the run",
+    cases = []
+    for each in verdict.findings:
+        refuses, text = _refuses(each, plan, strict=strict), _described(each)
+        cases.append(
+            Case(
+                classname=each.rule,
+                name=each.subject,
+                at=each.at,
+                failure=(each.message, text) if refuses else None,
+                note="" if refuses else text,
             )
-            for one in RULES
-            if one.family == family
-        ]
-        if family == "run":
-            cases.append(_end(verdict))
-        flows = verdict.flows if family == "flow" else ()
-        note = "".join(f"{_flow(each)}\n" for each in flows)
-        suites.append(Suite(name=family, cases=cases, note=note))
-    return junit(suites, name=f"lifecycle verify {plan.system}" if plan else "lifecycle verify")
+        )
+    flows = "".join(f"{_flow(each)}\n" for each in verdict.flows)
+    name = f"lifecycle verify {plan.system}" if plan else "lifecycle verify"
+    return junit(name, [*cases, _end(verdict)], note=flows)
 
 
 def _refuses(finding: Finding, plan: Plan | None, *, strict: bool) -> bool:
@@ -212,11 +184,8 @@ def _end(verdict: Verdict) -> Case:
     return Case(classname="run", name="end", failure=(run.reason, text))
 
 
-def _described(findings: Iterable[Finding]) -> str:
-    return "\n".join(
-        "".join(f"{line}\n" for line in _finding(each, colour=False, width=100))
-        for each in findings
-    )
+def _described(finding: Finding) -> str:
+    return "".join(f"{line}\n" for line in _finding(finding, colour=False, width=100))
 
 
 def _flow(flow: FlowReport) -> str:
@@ -289,36 +258,11 @@ def to_github(verdict: Verdict, *, strict: bool = False) -> str:
 
 
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:
-    """Write `{"verdict": …, "findings": [...], "flows": [...]}` and what else there is.
+    """Write the verdict, without what is as it mostly is: where no system was judged, `judged` is.
 
-    The last verdict of a run has `run`. Where no system was judged it has `"judged": false`, and
-    its findings are why. `indent`: spaces per level; None for one line.
+    `indent`: spaces per level; None for one line.
     """
-    document: dict[str, object] = {
-        "verdict": verdict.verdict.value,
-        "findings": plain_findings(verdict),
-        "flows": codec.to_plain(verdict.flows),
-    }
-    if not verdict.judged:
-        document["judged"] = False
-    for name in ("open_endpoints", "tolerated", "measured"):
-        if found := getattr(verdict, name):
-            document[name] = codec.to_plain(found)
-    if verdict.run is not None:
-        run = codec.to_plain(verdict.run)
-        assert isinstance(run, dict)
-        document["run"] = {name: value for name, value in run.items() if value or name != "trusted"}
-    separators = (",", ":") if indent is None else None
-    text = json.dumps(document, ensure_ascii=False, indent=indent, separators=separators)
-    return json_text(text)
-
-
-def plain_findings(verdict: Verdict) -> list[dict[str, object]]:
-    """Return the findings as JSON holds them: of the two ends their subject says enough."""
-    found = []
-    for each in verdict.findings:
-        plain = codec.to_plain(each)
-        assert isinstance(plain, dict)
-        del plain["ends"]
-        found.append(plain)
-    return found
+    text = codec.to_json(verdict)
+    if indent is not None:
+        text = msgspec.json.format(text, indent=indent)
+    return json_text(text.decode())

@@ -19,7 +19,6 @@ from lifecycle.manifest.names import (
     MODE_SERVICE,
     NODE_SERVICES,
     OUR_SERVICES,
-    SUPERVISOR_STATUS,
     SUPERVISORS,
     supervisor_prefix,
     supervisor_services,
@@ -27,7 +26,7 @@ from lifecycle.manifest.names import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan, uses_sim_time
-from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
+from lifecycle.verify.observation import ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"
 """Observers: every supervisor and every `lifecycle verify` has one. They are tolerated as tools,
@@ -37,8 +36,6 @@ _OUR_TOPICS = "/_lifecycle/"
 """Where the supervisors of several machines notice each other."""
 
 _DIAGNOSTICS = DIAGNOSTICS_TOPIC, "diagnostic_msgs/msg/DiagnosticArray"
-_SUPERVISOR_TOPIC = SUPERVISOR_STATUS, "std_msgs/msg/String"
-_SUPERVISOR_SERVICE_TYPE = "std_srvs/srv/Trigger"
 
 PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_"})
 """What rmw_dds_common calls the node of an endpoint whose node it does not know (yet)."""
@@ -132,15 +129,12 @@ class DeclaredNames(msgspec.Struct, frozen=True):
             `~/transition_event` and the like under its own name.
         ends: node, kind and name of every declared endpoint.
         names: by the kind that offers, fully qualified, those that endpoints declare.
-        of_supervisors: likewise, those that only supervisors of the plan may have, whatever
-            `policy.ros_interface` says.
         simulated: nodes of the plan have `use_sim_time`, so that it matters who publishes /clock.
     """
 
     nodes: frozenset[str] = frozenset()
     ends: frozenset[tuple[str, EndpointKind, str]] = frozenset()
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
-    of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
     simulated: bool = False
 
     @classmethod
@@ -152,17 +146,10 @@ class DeclaredNames(msgspec.Struct, frozen=True):
             for each in node.endpoints
         )
         names = frozenset((_offering(kind), name) for _, kind, name in ends)
-        of_supervisors = frozenset(
-            (kind, name)
-            for prefix in supervisor_prefixes(plan)
-            for kind, name in _below(prefix, plan, RosInterfaceAccess.FULL)
-        )
         return cls(
             nodes=frozenset(node.full_name for node in plan.nodes),
             ends=ends,
             names=names,
-            # A manifest may declare a node of its own that has them.
-            of_supervisors=of_supervisors - names,
             simulated=any(map(uses_sim_time, plan.nodes)),
         )
 
@@ -181,11 +168,7 @@ class DeclaredNames(msgspec.Struct, frozen=True):
             return False
         node, _, base = name.rpartition("/")
         is_own = node in self.nodes and base in _OWN.get(kind, ())
-        return self.has(kind, name) or is_own or (kind, name) in self.of_supervisors
-
-    def looks_for(self, kind: EndpointKind, name: str) -> bool:
-        """Return whether an undeclared node's endpoint is looked at, whatever it looks like."""
-        return self.fed_by(kind, name) or _is_status(kind, name)
+        return self.has(kind, name) or is_own or name.startswith(SUPERVISORS)
 
     def keeps(self, endpoint: ObservedEndpoint, node: str, *, ours: bool) -> bool:
         """Return whether an endpoint is declared, feeds what is, or was made on purpose.
@@ -193,9 +176,11 @@ class DeclaredNames(msgspec.Struct, frozen=True):
         `node` is whose it is, by full name; `ours`: see `is_noise_endpoint`.
         """
         kind, name = endpoint.kind, endpoint.name
+        declared = self.has(kind, name)
+        ours_own = is_of_observer(kind, endpoint.node, name, endpoint.type)
         return (
             (node, kind, name) in self.ends
-            or (node not in self.nodes and self.looks_for(kind, name))
+            or (node not in self.nodes and self.fed_by(kind, name) and (declared or not ours_own))
             or not is_noise_endpoint(kind, endpoint.node, name, endpoint.type, ours=ours)
         )
 
@@ -231,39 +216,20 @@ def supervisor_label(system: str, machine: str = "") -> str:
     return f"{system}/{machine}" if machine else system
 
 
-def supervisor_prefixes(plan: Plan) -> frozenset[str]:
-    """Return the prefixes that supervisors of a plan may have.
-
-    One that brings up all nodes has that of the system, also where it declares several machines.
-    """
-    machines = {each.machine for each in plan.nodes}
-    names = ("", *(machines if len(machines) > 1 else ()))
-    return frozenset(supervisor_prefix(plan.system, each) for each in names)
-
-
 def supervisor_endpoints(plan: Plan, machine: str = "") -> frozenset[tuple[EndpointKind, str]]:
     """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
-    found = _below(supervisor_prefix(plan.system, machine), plan, plan.policy.access)
-    if machine:
-        # Which mode a system is in that has several supervisors is not for one of them to say.
-        found = frozenset(each for each in found if f"/{MODE_SERVICE}" not in each[1])
-    diagnoses = found and takes_diagnostics(plan)
-    return found | ({(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC)} if diagnoses else set())
-
-
-def _below(
-    prefix: str, plan: Plan, access: RosInterfaceAccess
-) -> frozenset[tuple[EndpointKind, str]]:
-    """Return what the supervisor with a prefix offers below it."""
+    access = plan.policy.access
     if access is RosInterfaceAccess.OFF:
         return frozenset()
-    services = supervisor_services(access, (each.name for each in plan.modes))
-    return frozenset(
-        (
-            (EndpointKind.PUBLISHER, supervisor_status_topic(prefix)),
-            *((EndpointKind.SERVICE_SERVER, f"{prefix}/{name}") for name in services),
-        )
-    )
+    prefix = supervisor_prefix(plan.system, machine)
+    found = {(EndpointKind.PUBLISHER, supervisor_status_topic(prefix))}
+    for name in supervisor_services(access, (each.name for each in plan.modes)):
+        # Which mode a system is in that has several supervisors is not for one of them to say.
+        if not machine or not name.startswith(MODE_SERVICE):
+            found.add((EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"))
+    if takes_diagnostics(plan):
+        found.add((EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC))
+    return frozenset(found)
 
 
 def takes_diagnostics(plan: Plan) -> bool:
@@ -286,65 +252,14 @@ def takes_diagnostics(plan: Plan) -> bool:
     )
 
 
-def _is_status(kind: EndpointKind, name: str) -> bool:
-    """Return whether a name is that of a supervisor's status topic, of whatever system."""
-    below = name.startswith(SUPERVISORS) and name.rpartition("/")[2] == _SUPERVISOR_TOPIC[0]
-    return below and kind is EndpointKind.PUBLISHER
+def is_of_observer(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
+    """Return whether an endpoint is one by which supervisors notice each other, or are asked.
 
-
-def of_supervisors(
-    plan: Plan, endpoints: Iterable[ObservedEndpoint]
-) -> frozenset[ObservedEndpoint]:
-    """Return those endpoints of tools that supervisors offer as policies allow, of any system.
-
-    A name proves nothing: who offers something below a supervisor's prefix is that supervisor if
-    no other participant does, and what it publishes on /diagnostics is of that participant.
+    A name proves nothing: all that it lets a node do is to speak for a supervisor.
     """
-    ours = supervisor_prefixes(plan)
-    prefixes = {
-        place: prefix for prefix in ours for place in _below(prefix, plan, RosInterfaceAccess.FULL)
-    }
-    allowed = {place for prefix in ours for place in _below(prefix, plan, plan.policy.access)}
-    found: list[tuple[str, ObservedEndpoint]] = []
-    claims: dict[str, tuple[set[str], set[str]]] = {}
-    for each in endpoints:
-        if is_supervisor_endpoint(each.kind, each.node, each.name, each.type):
-            prefix = prefixes.get((each.kind, each.name), each.name.rpartition("/")[0])
-            found.append((prefix, each))
-            nodes, participants = claims.setdefault(prefix, (set(), set()))
-            nodes.add(each.node)
-            participants.update((each.gid[:PREFIX_DIGITS],) if each.gid else ())
-    believed = {
-        prefix: participants
-        for prefix, (nodes, participants) in claims.items()
-        if prefix and len(nodes) == 1 and len(participants) <= 1 and (allowed or prefix not in ours)
-    }
-    diagnosing = set().union(*believed.values()) if takes_diagnostics(plan) else set()
-
-    def is_one(prefix: str, each: ObservedEndpoint) -> bool:
-        if each.name == DIAGNOSTICS_TOPIC:
-            return each.gid[:PREFIX_DIGITS] in diagnosing
-        return prefix in believed and ((each.kind, each.name) in allowed or prefix not in ours)
-
-    return frozenset(each for prefix, each in found if is_one(prefix, each))
-
-
-def _is_observer(full_name: str) -> bool:
-    """Return whether a node is called as an observer of ours is."""
-    return bool(tolerating_pattern(full_name, ()))
-
-
-def is_supervisor_endpoint(kind: EndpointKind, node: str, name: str, type_: str) -> bool:
-    """Return whether an endpoint is one that `policy.ros_interface` has a supervisor make."""
-    if not _is_observer(node):
-        return False
-    base = name.rpartition("/")[2] if name.startswith(SUPERVISORS) else ""
-    if kind is EndpointKind.PUBLISHER:
-        return (name, type_) == _DIAGNOSTICS or (base, type_) == _SUPERVISOR_TOPIC
-    enters = name.startswith(SUPERVISORS) and name.split("/")[-2] == MODE_SERVICE[:-1]
-    known = enters or base in supervisor_services(RosInterfaceAccess.FULL)
-    serves = kind is EndpointKind.SERVICE_SERVER and known
-    return serves and type_ == _SUPERVISOR_SERVICE_TYPE
+    diagnoses = (kind, name, type_) == (EndpointKind.PUBLISHER, *_DIAGNOSTICS)
+    below = name.startswith((_OUR_TOPICS, SUPERVISORS)) or diagnoses
+    return below and bool(tolerating_pattern(node, ()))
 
 
 def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, ours: bool) -> bool:
@@ -358,10 +273,8 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     """
     if not node:
         return False
-    of_observers = name.startswith(_OUR_TOPICS) and _is_observer(node)
-    of_observers = of_observers or is_supervisor_endpoint(kind, node, name, type_)
     of_library = _is_service_event(kind, name, type_) or NOISE_TOPICS.get((kind, name)) == type_
-    if of_observers or of_library:
+    if of_library or is_of_observer(kind, node, name, type_):
         return True
     owner, _, base = name.rpartition("/")
     of_container = owner.endswith(_CONTAINER) and _CONTAINER_SERVICES.get(base) == type_
@@ -482,44 +395,6 @@ def _action_hash(*parts: ObservedEndpoint) -> str | None:
     """Return the type hash of an action from those of its parts; None while one is not seen."""
     known = [each.type_hash for each in parts if each.type_hash is not None]
     return join(known) if len(known) == len(parts) else None
-
-
-class Owner(msgspec.Struct, frozen=True):
-    """Whose a hidden node is, as that node itself reports.
-
-    Attributes:
-        node: full name of the planned node that has it.
-        prefixes: GUID prefixes of the participants that the owner reports, 24 hex digits each: what
-            has another one is not the owner's, whatever its node is called.
-    """
-
-    node: str
-    prefixes: frozenset[str]
-
-    def has(self, endpoint: ObservedEndpoint) -> bool:
-        """Return whether an endpoint of the hidden node is the owner's, as far as its GID says."""
-        return not endpoint.gid or endpoint.gid[:PREFIX_DIGITS] in self.prefixes
-
-
-def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dict[str, Owner]:
-    """Return whose every hidden node of planned nodes is, by its full name.
-
-    A name proves nothing: any process can call a node `_camera_flow_0`. Only the node that has it
-    can say so, and on which participant it is.
-    """
-    found: dict[str, Owner] = {}
-    for each in reported:
-        hidden = {one.node_name for one in each.connections}
-        hidden |= {one.participant for one in each.endpoints}
-        hidden -= {""}
-        if each.name not in nodes or not hidden:
-            continue
-        prefixes = {one.prefix for one in each.connections}
-        prefixes |= {one.gid[:PREFIX_DIGITS] for one in each.endpoints}
-        owner = Owner(each.name, frozenset(prefixes - {""}))
-        namespace = each.name.rpartition("/")[0]
-        found |= {f"{namespace}/{name}": owner for name in hidden}
-    return found
 
 
 def is_hidden_node(full_name: str) -> bool:

@@ -39,7 +39,7 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
         endpoint: kind of the endpoint it concerns; None if it is not about one endpoint.
         hint: what to do about it.
         ends: of a flow or a pair, fully qualified names of the nodes at its two ends, as far as
-            they are known; `subject` says it for people, and reports write no more than that.
+            they are known; `subject` says it for people.
     """
 
     rule: str
@@ -118,38 +118,21 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
         return self.topic, self.publisher, self.subscription
 
 
-class OpenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """An endpoint that no manifest declares, of a node that may have such: `endpoints: open`.
-
-    Attributes:
-        node: fully qualified node name.
-        name: fully qualified.
-    """
-
-    kind: EndpointKind
-    node: str
-    name: str
-    type: str
-
-
 class ToleratedNode(msgspec.Struct, frozen=True, kw_only=True):
     """A node that no manifest declares and that the policy lets be there.
 
     Attributes:
         node: fully qualified node name; empty for endpoints whose node is not known.
         because: what tolerates it: `tolerated_nodes: rviz_*` or `undeclared_nodes: open`.
-        endpoints: what it has, without the housekeeping of client libraries.
     """
 
     node: str
     because: str
-    endpoints: tuple[OpenEndpoint, ...] = ()
 
-    def describe(self) -> str:
-        """Return it in short, `/rviz2 (subscription of /map)`."""
-        named = dict.fromkeys(f"{each.kind.noun} of {each.name}" for each in self.endpoints)
-        name = self.node or "an unknown node"
-        return f"{name} ({', '.join(named)})" if named else name
+    @property
+    def name(self) -> str:
+        """How messages name it."""
+        return self.node or "an unknown node"
 
 
 _ENDED = {
@@ -160,7 +143,7 @@ _ENDED = {
 }
 
 
-class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
+class RunEnd(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How a run of a supervisor ended.
 
     Attributes:
@@ -183,15 +166,14 @@ class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
         return f"ended {_ENDED[self.reached]}, exit code {self.exit_code}: {self.reason}{trusted}"
 
 
-class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+class Verdict(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The result of `verify`.
 
     Attributes:
         verdict: VIOLATED if any finding is; else UNVERIFIABLE if any finding is; else OK.
         blocking: the gate stays closed: VIOLATED, or UNVERIFIABLE where the policy says so.
-        open_endpoints: what nodes made in code and may make; no finding, but nothing is hidden.
-        tolerated: undeclared nodes that the policy lets be there; no finding either. Observers of
-            this project are not listed while they do nothing but observe.
+        tolerated: undeclared nodes that the policy lets be there; no finding. Observers of this
+            project are not listed.
         judged: a system was looked at and every rule applied. If not, a rule without a finding
             says nothing, and the findings are what kept it from being judged.
         measured: what has arrived of each flow that is counted, of an active system.
@@ -202,7 +184,6 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     blocking: bool
     findings: tuple[Finding, ...]
     flows: tuple[FlowReport, ...]
-    open_endpoints: tuple[OpenEndpoint, ...] = ()
     tolerated: tuple[ToleratedNode, ...] = ()
     judged: bool = True
     run: RunEnd | None = None

@@ -6,6 +6,7 @@ fills it, anew for each verdict. Pure.
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Mapping
 
 import msgspec
@@ -38,6 +39,18 @@ from lifecycle.verify.tool_filter import DeclaredNames
 from lifecycle.verify.verdict import Stage
 
 
+class Whose(enum.Enum):
+    """Whose an endpoint is."""
+
+    DECLARED = "declared"
+    UNDECLARED = "a declared node's, and no declaration covers it"
+    TWIN = "a second node's of a declared name, or one of the two"
+    FOREIGN = "a node's that is not declared, and no tool"
+    TOOL = "a tool's that the policy tolerates"
+    UNKNOWN = "a node's that is not known"
+    DEPARTED = "a process's that has ended: others may count it as a peer until its lease ends"
+
+
 class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint of the graph, declared or not: what others can match with.
 
@@ -46,13 +59,11 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
             their node; empty while unknown.
         type: as discovery shows it, else as it is declared.
         qos: as announced or reported; None where neither is known.
+        whose: whose it is.
+        observed: what discovery shows; None if it does not show the endpoint.
         report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
         type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
-        is_stranger: it is none that the system has for good: whatever can match it may be matched
-            with it or not.
-        has_ended: its process has; others may count it as a peer until its lease ends.
-        is_shown: discovery or its node shows it; else it is known from its declaration alone.
     """
 
     kind: EndpointKind
@@ -60,12 +71,21 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     type: str
     qos: QosProfile | None
+    whose: Whose = Whose.DECLARED
+    observed: ObservedEndpoint | None = None
     report: EndpointReport | None = None
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
-    is_stranger: bool = False
-    has_ended: bool = False
-    is_shown: bool = True
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether discovery or its node shows it; else it is known from its declaration alone."""
+        return self.observed is not None or self.report is not None
+
+    @property
+    def is_passing(self) -> bool:
+        """Whether it is a tool's, or has ended: no rule is about it."""
+        return self.whose in (Whose.TOOL, Whose.DEPARTED)
 
     @property
     def where(self) -> str:
@@ -73,7 +93,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         return f"the {self.kind.noun} of {self.name} in {self.node or 'an unknown node'}"
 
     @classmethod
-    def of(cls, endpoint: ObservedEndpoint) -> SeenEndpoint:
+    def of(cls, endpoint: ObservedEndpoint, whose: Whose) -> SeenEndpoint:
         """Return one that is not declared."""
         return SeenEndpoint(
             kind=endpoint.kind,
@@ -81,8 +101,9 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
             name=endpoint.name,
             type=endpoint.type,
             qos=endpoint.qos,
+            whose=whose,
+            observed=endpoint,
             type_hash=endpoint.type_hash,
-            is_stranger=True,
         )
 
 
@@ -91,7 +112,6 @@ class Actual(SeenEndpoint, frozen=True, kw_only=True):
 
     Attributes:
         owner: the node it belongs to.
-        observed: what discovery shows; None if it does not show the endpoint.
         unseen: discovery cannot be expected to show it to this observer; `observed` is what its
             node says then.
         beyond: its whole node is out of this observer's reach, and so is its report.
@@ -99,7 +119,6 @@ class Actual(SeenEndpoint, frozen=True, kw_only=True):
 
     owner: PlannedNode
     planned: PlannedEndpoint
-    observed: ObservedEndpoint | None
     unseen: bool = False
     beyond: bool = False
 
@@ -167,6 +186,11 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return flow_subject(self.planned.topic, self.publisher, self.subscription)
 
     @property
+    def where(self) -> str:
+        """How messages name it."""
+        return f"the flow {self.publisher} → {self.subscription} on {self.planned.topic}"
+
+    @property
     def ends(self) -> tuple[str, str]:
         """Fully qualified names of the two nodes."""
         return self.publisher, self.subscription
@@ -197,6 +221,10 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.writer.planned.five_qi if self.writer else None
 
 
+TopicEnds = tuple[list[SeenEndpoint], list[SeenEndpoint]]
+"""Publishers and subscriptions of a topic."""
+
+
 class View(msgspec.Struct, frozen=True, kw_only=True):
     """The input of every rule.
 
@@ -212,15 +240,10 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         configurations: reports by full node name; the first of several.
         nodes: what is known of every declared node, by full name, in plan order.
         actual: every declared endpoint, in plan order.
-        undeclared: endpoints of declared nodes that no declaration covers, sorted.
-        unattributed: endpoints whose node is not known, sorted.
-        foreign: endpoints of nodes that are not in the plan and no tools, sorted.
+        others: all other endpoints that are judged, sorted.
+        topics: publishers and subscriptions by topic: declared ones that are seen or beyond reach,
+            and others.
         tools: undeclared nodes that the policy tolerates, and the pattern that says so, sorted.
-        of_tools: their endpoints, housekeeping left out, sorted.
-        groups: all endpoints that are judged by full node name, sorted by it.
-        seen: every publisher and subscription of the graph, tools left out, sorted.
-        seen_of_tools: those of tools, which others may be matched with too.
-        departed: those of processes that have ended, which others may be matched with still.
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
         measured: what subscriptions of the observer have counted; None where it has none.
@@ -243,21 +266,19 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     configurations: dict[str, NodeConfiguration]
     nodes: dict[str, NodeFacts]
     actual: tuple[Actual, ...]
-    undeclared: tuple[ObservedEndpoint, ...]
-    unattributed: tuple[ObservedEndpoint, ...]
-    foreign: tuple[ObservedEndpoint, ...]
+    others: tuple[SeenEndpoint, ...]
+    topics: dict[str, TopicEnds]
     tools: dict[str, str]
-    of_tools: tuple[ObservedEndpoint, ...]
-    groups: dict[str, tuple[ObservedEndpoint, ...]]
-    seen: tuple[SeenEndpoint, ...]
-    seen_of_tools: tuple[SeenEndpoint, ...]
-    departed: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
     measured: Measured | None
     active_s: Mapping[str, float]
     clocks: Mapping[str, ClockOffset] | None
     marks: Mapping[tuple[str, int], int | None]
+
+    def of(self, *whose: Whose) -> list[SeenEndpoint]:
+        """Return the endpoints of these that are not declared, sorted."""
+        return [each for each in self.others if each.whose in whose]
 
 
 def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:

@@ -51,7 +51,7 @@ def test_a_dscp_that_a_router_clears_is_found_and_heals(hosts: Hosts, tmp_path: 
         until(right, tmp_path / "b", "ok")
         router.run("nft", "-f", "-", stdin=BLEACHES)
         found = until(right, tmp_path / "b", "violated")
-        assert found == "wrong: /p1: /n1 → /n2 (flow.dscp-lost)"
+        assert found == "/p1: /n1 → /n2 (flow.dscp-lost)"
         assert "beside the flow /n1 → /n2 on /p1 arrives as DF = DSCP 0" in (
             tmp_path / "b.log"
         ).read_text(encoding="utf-8")

@@ -39,7 +39,7 @@ def test_a_node_that_is_not_discovered_is_started_again_on_a_fresh_port(
         told = next(each for each in notices if "fresh port" in each)
         assert told.startswith(
             "'/listener' is started again on a fresh port: not discovered over TCP for 5 s "
-            "(missing: /listener (node)"
+            "(/listener (graph.missing-node)"
         )
         assert run.of_kind("gate") == []
         run.until("system", reached="active")

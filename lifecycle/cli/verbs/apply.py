@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import click
 from msgspec.structs import asdict
 
 from lifecycle.cli import common
 from lifecycle.codec import Count, says
-from lifecycle.errors import BringUpError, ExitCode
+from lifecycle.errors import ExitCode
 from lifecycle.printable import lines
 from lifecycle.supervisor.control.protocol import ChangedNodes
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from lifecycle.plan.model import Plan
-    from lifecycle.supervisor.control.protocol import Answer
 
 _SHOWN_S = 10.0
 """For a supervisor to say what would change: it only compares two plans."""
@@ -81,10 +75,12 @@ def command(
     """
     plan = common.load_plan(manifest, assignments, machine=machine)
     from lifecycle.run_directory import find_run, run_name, run_roots
+    from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     path = find_run(run_roots(os.environ), run_name(plan, machine))
     as_text = format_ == "text"
-    answer = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
+    question = Question(ask=ControlRequest.APPLY, plan=plan, dry_run=True)
+    answer = order(path, question, _SHOWN_S)
     change = answer.change
     if answer.error or change is None:
         outcome = "refused"
@@ -103,8 +99,8 @@ def command(
             click.echo(lines("\n".join((*change.differences, *done))))
         outcome = "would_apply"
     if outcome == "would_apply" and not dry_run:
-        wait_s = 2 * timeout + _SPARE_S
-        answer = _asked(path, plan, dry_run=False, timeout_s=timeout, wait_s=wait_s)
+        question = Question(ask=ControlRequest.APPLY, plan=plan, timeout_s=timeout)
+        answer = order(path, question, 2 * timeout + _SPARE_S)
         change = answer.change or change
         outcome = "applied"
         if answer.error:
@@ -128,17 +124,3 @@ def command(
             f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
         )
     return report.exit_code
-
-
-def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: float) -> Answer:
-    from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
-
-    question = Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
-    try:
-        return order(path, question, wait_s)
-    except TimeoutError as error:
-        raise BringUpError(
-            f"cannot apply {plan.manifest_path} to {path.name!r} within {wait_s:g} s; it is still "
-            "at it",
-            hint=f"see what it does: lifecycle status {path.name}",
-        ) from error

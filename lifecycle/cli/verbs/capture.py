@@ -32,13 +32,6 @@ if TYPE_CHECKING:
     help="Write each node's interface as a NoDL document there; the manifest refers to them.",
 )
 @click.option(
-    "--namespace",
-    "namespaces",
-    multiple=True,
-    metavar="NAMESPACE",
-    help="Take only nodes in or below it; may be given several times.",
-)
-@click.option(
     "--attach",
     is_flag=True,
     help="Write nodes that others start; do not look how their processes were started.",
@@ -57,7 +50,6 @@ def command(
     domain: int | None,
     output: Path | None,
     nodl_dir: Path | None,
-    namespaces: tuple[str, ...],
     attach: bool,
     system: str,
     wait: float,
@@ -85,14 +77,12 @@ def command(
         system=system,
         domain_id=effective_domain(discovery, os.environ),
         discovery_range=effective_range(discovery, os.environ),
-        namespaces=namespaces,
         wait_s=wait,
         attach=attach,
     )
     if not captured.nodes:
-        below = f" in or below {', '.join(namespaces)}" if namespaces else ""
         say(
-            f"no node{below}; looked in ROS domain {captured.domain_id}, discovery range "
+            f"no node; looked in ROS domain {captured.domain_id}, discovery range "
             f"{captured.discovery_range.value}\n"
             "nodes that only listed peers, a discovery server or shared memory lead to are not "
             "found so: `discovery: mode:` of their manifest says which; it is what to verify them "

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import msgspec
 
-from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
+from lifecycle.ci_formats import Case, Problem, github, junit, sarif
 from lifecycle.cli import common
 from lifecycle.cli.report import report_format, report_option, write_report
 from lifecycle.codec import Count
@@ -112,7 +112,7 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
         failure=(failed[0], "\n".join(failed)) if failed else None,
         note=write_check(report, "text", strict=strict),
     )
-    return junit([Suite(name=f"lifecycle check {report.manifest}", cases=[case])])
+    return junit(f"lifecycle check {report.manifest}", [case])
 
 
 def _sarif(report: CheckReport) -> str:

@@ -253,11 +253,7 @@ def _give_order(
     from lifecycle.supervisor.control.protocol import ControlRequest, Question, order
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
-    try:
-        answer = order(path, question, timeout)
-    except TimeoutError:
-        common.say(f"cannot {verb} {path.name!r} within {timeout:g} s; it is still at it")
-        return ExitCode.BRING_UP_FAILED
+    answer = order(path, question, timeout)
     if answer.error:
         common.say(answer.error)
     assert answer.exit_code is not None

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from lifecycle.printable import count, lines
 from lifecycle.programming import TARGETS
 from lifecycle.run_directory import run_name, runtime_root
 from lifecycle.verify.judge import not_ok
-from lifecycle.verify.verdict import FlowReport
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
@@ -121,9 +120,17 @@ def _show(
     program = common.read_networks((export_,) if export_ else (), rest, option="--export")
     plan = _plan_of(target, assignments)
     if record is not None:
-        return _record(plan, Record(record))
-    if watch:
-        return _watch(plan, format_)
+        with contextlib.closing(Record(record)) as written:
+            try:
+                over = _follow(plan, lambda verdict: written.add(verdict.measured))
+            finally:
+                common.say(f"{count(written.rows, 'row')} in {str(record)!r}")
+    elif watch:
+        with watched(whole=format_ == "text") as show:
+            over = _follow(plan, lambda verdict: show(watched_flows(verdict, format_)))
+    if record is not None or watch:
+        common.say(over)
+        return ExitCode.OK
     seen = looking.judge_running(plan, timeout_s=timeout, strict=False)
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
@@ -146,61 +153,27 @@ def _measuring(plan: Plan) -> Path | None:
     return next((each for each in found if each is not None), None)
 
 
-def _watch(plan: Plan, format_: str) -> int:
-    from lifecycle.supervisor.control.protocol import follow
-    from lifecycle.supervisor.run.looking import follow_running
-
-    path = _measuring(plan)
-    with watched(whole=format_ == "text") as show:
-        if path is None:
-            follow_running(
-                plan, lambda seen: show(watched_flows(seen.verdict, format_)), each_s=_EACH_S
-            )
-            return ExitCode.OK
-        with common.asking(path):
-            for seen in follow(path):
-                if seen.verdict is not None:
-                    show(watched_flows(seen.verdict, format_))
-    common.say(f"{path.name}: its supervisor has ended")
-    return ExitCode.OK
-
-
 _EACH_S = 1.0
 """What is measured changes so often."""
 
 
-def _record(plan: Plan, record: Record) -> int:
-    """Write what is measured each second, until it is interrupted or the supervisor ends."""
+def _follow(plan: Plan, take: Callable[[Verdict], None]) -> str:
+    """Give each verdict as it changes, with what is measured; return why there are no more.
+
+    Where no supervisor of this host measures, it is looked from outside until interrupted.
+    """
+    from lifecycle.supervisor.control.protocol import follow
     from lifecycle.supervisor.run.looking import follow_running
 
     path = _measuring(plan)
-    with contextlib.closing(record):
-        try:
-            if path is not None:
-                _record_supervised(path, record)
-            else:
-                follow_running(plan, lambda seen: record.add(seen.verdict.measured), each_s=_EACH_S)
-        finally:
-            common.say(f"{count(record.rows, 'row')} in {str(record.path)!r}")
-    return ExitCode.OK
-
-
-def _record_supervised(path: Path, record: Record) -> None:
-    from lifecycle.supervisor.control.protocol import status
-
-    began_s = time.monotonic()
-    for number in itertools.count():
-        time.sleep(max(0.0, began_s + number * _EACH_S - time.monotonic()))
-        try:
-            measured = status(path).measured
-        except TimeoutError:
-            continue  # it is busy; the next one may be answered
-        except UsageError:
-            if number == 0:
-                raise
-            common.say(f"{path.name}: its supervisor has ended")
-            return
-        record.add(measured)
+    if path is None:
+        follow_running(plan, lambda seen: take(seen.verdict), each_s=_EACH_S)
+        return "nothing more to see"
+    with common.asking(path):
+        for seen in follow(path):
+            if seen.verdict is not None:
+                take(seen.verdict)
+    return f"{path.name}: its supervisor has ended"
 
 
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:

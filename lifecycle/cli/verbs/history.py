@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import completing, format_option, say
+from lifecycle.cli.common import format_option, say
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, one_line, sentence
@@ -53,7 +53,7 @@ def _recorded(run: str | None, system: str) -> tuple[list[Moment], int]:
 
 
 @click.command("history")
-@click.argument("run", required=False, metavar="[RUN]", shell_complete=completing("runs"))
+@click.argument("run", required=False, metavar="[RUN]")
 @click.option("--system", default="", metavar="NAME", help="The latest run of this system.")
 @format_option("text", "json")
 def command(*, run: str | None, system: str, format_: str) -> int:

@@ -13,13 +13,11 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
 from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,
+    PARTICIPANTS_PER_DOMAIN,
     Capacity,
-    EphemeralRange,
     ParticipantPorts,
-    PortUse,
     describe_domains,
     max_participants,
-    overlaps,
     participant_ports,
     read_ephemeral_range,
     safe_domains,
@@ -32,6 +30,7 @@ class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
     """All that the verb says; the JSON document has these keys.
 
     Attributes:
+        ephemeral: first and last port that Linux gives to sockets without one.
         safe_domains: first and last id of each run.
         localhost_participants: so many of one host all find each other with `range: localhost`.
         unique_subscription_ports: first and last.
@@ -40,8 +39,7 @@ class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
     domain_id: int
     participant_id: int
     ports: ParticipantPorts
-    overlaps: tuple[PortUse, ...]
-    ephemeral: EphemeralRange
+    ephemeral: tuple[int, int]
     safe_domains: tuple[tuple[int, int], ...]
     capacity: Capacity
     localhost_participants: int
@@ -69,8 +67,7 @@ def command(*, domain: int | None, participant: int, format_: str) -> int:
             domain_id=domain,
             participant_id=participant,
             ports=participant_ports(domain, participant),
-            overlaps=overlaps(domain, participant),
-            ephemeral=ephemeral,
+            ephemeral=(ephemeral[0], ephemeral[-1]),
             safe_domains=tuple((run[0], run[-1]) for run in safe_domains(ephemeral)),
             capacity=max_participants(domain, ephemeral),
             localhost_participants=LOCALHOST_PARTICIPANTS,
@@ -94,10 +91,11 @@ def _lines(report: PortsReport) -> list[str]:
         f"  user unicast          {report.ports.user_unicast}",
         f"  unique subscriptions  {first}–{last} (Fast DDS; shared by all domains of a host)",
     ]
-    lines += [f"  overlaps with         {_use(each)}" for each in report.overlaps]
+    if report.participant_id >= PARTICIPANTS_PER_DOMAIN:
+        lines.append("  overlaps with         ports of the domains after it")
     runs = tuple(range(low, high + 1) for low, high in report.safe_domains)
     lines += [
-        f"this machine: ephemeral ports {report.ephemeral}",
+        f"this machine: ephemeral ports {report.ephemeral[0]}–{report.ephemeral[1]}",
         f"  safe domains          {describe_domains(runs)}",
         (
             f"  fit in domain {report.domain_id:<8}{capacity.participants} participants per host, "
@@ -106,8 +104,3 @@ def _lines(report: PortsReport) -> list[str]:
         f"  find each other       {report.localhost_participants} with 'range: localhost'",
     ]
     return lines
-
-
-def _use(use: PortUse) -> str:
-    who = "" if use.participant_id is None else f" of participant {use.participant_id}"
-    return f"{use.role.replace('_', ' ')}{who} of domain {use.domain_id}"

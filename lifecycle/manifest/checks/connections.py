@@ -184,16 +184,15 @@ def check_types(system: DeclaredSystem) -> Iterator[Diagnostic]:
         types = types_of(package)
         if package in absent or (types is not None and name in types):
             continue
-        nearest = installed_types.nearest_type(type_, system.prefixes)
-        hint = f"did you mean {nearest!r}?" if nearest else ""
         if types is not None:
+            hint = did_you_mean(name, types)
             message = f"cannot find type {type_!r}: package {package!r} has no such type"
             yield error("check.type-unknown", endpoint.at, message, hint)
         else:
             # Once per package: the answer is the same for all of its types.
             absent.add(package)
             message = f"cannot tell whether {type_!r} exists: {package!r} is not installed here"
-            yield warning("check.type-not-installed", endpoint.at, message, hint)
+            yield warning("check.type-not-installed", endpoint.at, message)
     first: dict[tuple[str, str], Resolved] = {}
     for each in system.endpoints:
         family = each.endpoint.kind.meets_in

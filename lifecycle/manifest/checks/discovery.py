@@ -27,7 +27,6 @@ from lifecycle.network.medium import (
     DEFAULT_RMW,
     FAST_DDS,
     TRANSPORTS_VARIABLE,
-    datagram_bytes,
 )
 from lifecycle.network.nfe import UniqueRequirement
 
@@ -221,8 +220,8 @@ def check_fragments(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
             continue
         message = (
             f"cannot send a message of {each.need.name!r}, up to {size} bytes (declared), in one "
-            f"datagram: with RTPS it is {datagram_bytes(size)} of UDP payload, and of IP's "
-            "fragments only the first has ports, so a network would not know the others"
+            "datagram: of IP's fragments only the first has ports, so a network would not know the "
+            "others as this flow"
         )
         hint = f"start it with {TRANSPORTS_VARIABLE}='UDPv4?max_msg_size={most}B'"
         if node.run.kind is RunKind.PYTHON:

@@ -82,19 +82,15 @@ def _priority(need: FlowNeed, tos: int | None) -> Iterator[Diagnostic]:
     number = need.transport_priority or 0
     priority = f"transport_priority {number} ({number:#x})"
     if need.dscp is not None:
-        message = (
-            f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
-            f"the whole mark"
-        )
+        message = f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority"
         hint = f"keep one; the one is {describe(need.dscp)}, the other {priority}"
         yield error("check.flow-dscp", need.at, message, hint)
     elif tos is not None and tos & ECN_MASK:
         message = (
-            f"cannot use {priority}: it is TOS {tos} ({tos:#04x}), whose two lowest bits are ECN "
-            f"and belong to the transport (RFC 3168)"
+            f"cannot use {priority}: the two lowest bits of TOS {tos} are ECN and belong to the "
+            "transport (RFC 3168)"
         )
-        hint = f"without them it is {describe(tos >> 2)}"
-        yield error("check.flow-dscp", need.at, message, hint)
+        yield error("check.flow-dscp", need.at, message, f"without them it is {describe(tos >> 2)}")
 
 
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
@@ -193,9 +189,7 @@ def check_numbers(system: DeclaredSystem) -> Iterator[Diagnostic]:
         asked.setdefault(link.topic, []).extend(link.quantities)
     for topic in {**published, **asked}:
         if len(system.named(EndpointKind.PUBLISHER, topic)) == 1:  # several may add up
-            of_topic = published.get(topic, ()), asked.get(topic, ())
-            yield from _together(*of_topic)
-            yield from _each_other(*of_topic)
+            yield from _together(published.get(topic, ()), asked.get(topic, ()))
 
 
 def _alone(declared: FlowNeed | Link) -> Iterator[Diagnostic]:
@@ -227,20 +221,6 @@ def _together(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Itera
         if silence.value < period_s:
             message = f"cannot keep {silence}: {where}, one message in {period_s:.3g} s"
             yield error(_NUMBER, silence.at, message)
-
-
-def _each_other(published: Sequence[Quantity], asked: Sequence[Quantity]) -> Iterator[Diagnostic]:
-    """Compare what the data of a topic are to be in one place with the same in another."""
-    for limit in _named("rate_hz", asked):
-        if limit.most is None or limit.most < limit.value:
-            continue
-        where = f"{limit} is asked for, too ({limit.at.spelled})"
-        for rate in _named("rate_hz", asked):
-            if rate is not limit and rate.value * (1 - rate.slack) > limit.most:
-                yield error(_NUMBER, rate.at, f"cannot keep {rate}: {where}")
-        for silence in _named("max_silence_s", (*published, *asked)):
-            if silence.value * limit.most < 1:
-                yield error(_NUMBER, silence.at, f"cannot keep {silence}: {where}")
 
 
 def _named(name: str, numbers: Iterable[Quantity]) -> Iterator[Quantity]:

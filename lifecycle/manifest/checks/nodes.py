@@ -25,13 +25,11 @@ from lifecycle.manifest.model import (
     TargetState,
 )
 from lifecycle.manifest.names import (
-    NODE_SERVICES,
-    OUR_SERVICES,
     full_name_problem,
     name_problem,
     topic_of,
 )
-from lifecycle.manifest.parameter_values import is_implicit, misfit, suggestion
+from lifecycle.manifest.parameter_values import is_implicit
 
 
 def check_machine(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
@@ -192,25 +190,15 @@ def _never_deactivated(node: Node) -> str:
 def _delays(node: Node) -> Iterator[Diagnostic]:
     """Judge the delays of a process that is started again."""
     how = node.supervision
-    longest = how.restart_max_delay_sec
-    if longest is not None and longest < how.restart_sec:
+    longest, grows = how.restart_max_delay_sec, how.restart_steps > 0
+    if grows is (longest is None) or (longest is not None and not 0 < how.restart_sec <= longest):
         message = (
-            f"cannot wait {longest:g} s at most: restart_sec is {how.restart_sec:g}, the shortest"
+            "cannot let the delay grow: it does from restart_sec, which is not 0, in restart_steps "
+            "to restart_max_delay_sec"
         )
-        at = node.where("restart_max_delay_sec")
-        yield error("check.restart", at, message, "set restart_max_delay_sec >= restart_sec")
-    elif longest is not None and longest > how.restart_sec and how.restart_steps == 0:
-        message = f"cannot let the delay grow to {longest:g} s: no restart_steps say how fast"
-        at = node.where("restart_max_delay_sec")
-        yield error("check.restart", at, message, "set 'restart_steps: 5' beside it")
-    if how.restart_steps and longest is None:
-        message = f"cannot let the delay grow in {how.restart_steps} steps: up to what is not said"
-        at = node.where("restart_steps")
-        yield error("check.restart", at, message, "set 'restart_max_delay_sec' beside it")
-    elif how.restart_steps and not how.restart_sec:
-        message = "cannot let the delay grow from 0 s: it grows by a factor"
-        at = node.where("restart_sec")
-        yield error("check.restart", at, message, "set 'restart_sec: 0.1' or more")
+        at = node.positions.get("restart_max_delay_sec", node.where("restart_steps"))
+        hint = "write 'restart_sec: 0.1', 'restart_steps: 5' and 'restart_max_delay_sec: 30'"
+        yield error("check.restart", at, message, hint)
     least_s = how.restart_sec * how.start_limit_burst
     interval_s = how.start_limit_interval_sec
     if interval_s and least_s > interval_s:
@@ -332,7 +320,7 @@ def check_readiness(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
         if other in (None, node) or not isinstance(wanted, Readiness):
             continue
         if wanted.by is ReadyBy.PARAMETER:
-            yield from _ready_parameter(after, wanted, other, system)
+            yield from _ready_parameter(after, wanted, other)
         elif problem := name_problem(wanted.name):
             message = f"cannot wait until {after.node!r} {wanted}: {problem}"
             yield error("check.name", after.at, message)
@@ -347,14 +335,6 @@ def _ready_endpoint(
     names = [(kind, topic_of(other, wanted.name, kind)) for kind in wanted.by.kinds]
     if any(each.node.key == other.key for one in names for each in system.named(*one)):
         return
-    of_every_node = {"/rosout", "/parameter_events"}
-    of_every_node |= {
-        f"{other.full_name}/{each}" for each in (*NODE_SERVICES, *OUR_SERVICES, "transition_event")
-    }
-    if not of_every_node.isdisjoint(name for _, name in names):
-        hint = f"write '{after.node}: started'"
-        yield error("check.after-undeclared", after.at, f"{message}: every node has it", hint)
-        return
     declared = [each.name for each in other.interface.endpoints if each.kind in wanted.by.kinds]
     why = f"{message}: its interface declares no such {noun}"
     hint = did_you_mean(wanted.name, declared)
@@ -365,29 +345,17 @@ def _ready_endpoint(
         yield note("check.after-undeclared", after.at, f"{why}, and may have others", hint)
 
 
-def _ready_parameter(
-    after: After, wanted: Readiness, other: Node, system: DeclaredSystem
-) -> Iterator[Diagnostic]:
-    name, value = wanted.name, wanted.value
-    message = f"cannot wait until {after.node!r} {wanted}"
-    given, at = dict(other.parameters), other.where(f"parameters.{name}")
-    declared = {each.name: each for each in other.interface.parameters}
-    if (declaration := declared.get(name)) is None:
-        if other.interface.has_all_parameters and not is_implicit(name):
-            why = f"{message}: its interface declares no such parameter"
-            hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
-            yield error("check.after-undeclared", after.at, why, hint)
-    elif value is not None and misfit(value, declaration.type):
-        why = f"{message}: it is declared as {declaration.type}"
-        yield error("check.after-value", after.at, why, suggestion(value, declaration.type))
-        return
-    elif name not in given and declaration.default is not None:
-        given, at = {name: declaration.default}, declaration.at
-    modes = (each for mode in system.manifest.modes for each in mode.parameters)
-    is_fixed = all((each.node, each.name) != (other.key, name) for each in modes)
-    if given.get(name, value) != value and is_fixed:
-        why = f"{message}: it must keep the value that it is given at {at.spelled}"
-        yield error("check.after-value", after.at, why, "leave that value out")
+def _ready_parameter(after: After, wanted: Readiness, other: Node) -> Iterator[Diagnostic]:
+    declared = {each.name: each.type for each in other.interface.parameters}
+    type_, why, hint = declared.get(wanted.name, ""), "", ""
+    if type_ and type_ != "bool":
+        why = f"it is declared as {type_}"
+    elif not type_ and other.interface.has_all_parameters and not is_implicit(wanted.name):
+        why = "its interface declares no such parameter"
+        hint = did_you_mean(wanted.name, declared) or "declare it under 'interface.parameters'"
+    if why:
+        message = f"cannot wait until {after.node!r} {wanted}: {why}"
+        yield error("check.after-undeclared", after.at, message, hint)
 
 
 CHECKS = (check_processes, check_on_violation, check_modes)

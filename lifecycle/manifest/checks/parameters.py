@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic, Position, error, note, warning
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.interface import nearest_file
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.parameter_files import (
@@ -121,20 +121,6 @@ def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
     return any(name == found for found, _, _ in system.files.given(node))
 
 
-def check_unused(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Say of values that an attached node is judged by that it is never given them."""
-    if node.run.kind is not RunKind.ATTACH or node.run.component:
-        return
-    own = [f"parameters.{name}" for name, _ in node.parameters]
-    places = [(place, "parameters") for place in own if place not in node.shared]
-    if node.parameter_files:
-        places.append(("parameter_files.0", "parameter files"))
-    for place, what in places[:1]:
-        message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
-        hint = "give them where it is started"
-        yield note("check.parameter-unused", node.where(place), message, hint)
-
-
 class CommandParameter(NamedTuple):
     """What a command line sets of parameters: a file, or one parameter.
 
@@ -189,11 +175,18 @@ def given_value(text: str) -> ParameterValue | None:
 
 
 def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about every parameter file that a node names."""
-    readers: dict[str, list[tuple[Node, Position]]] = {}
+    """Yield findings about every parameter file that a node names, on its command line too."""
+    readers: dict[str, list[tuple[Node, Position, list[str]]]] = {}
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
-            readers.setdefault(path, []).append((node, node.where(f"parameter_files.{index}")))
+            at = node.where(f"parameter_files.{index}")
+            readers.setdefault(path, []).append((node, at, [node.full_name]))
+        process = [each.full_name for each in system.processes[node.process_name]]
+        for each in command_line_parameters(node):
+            if os.path.exists(each.file):  # where the program will run it may be another one
+                at = node.where("run.command")
+                readers.setdefault(each.file, []).append((node, at, process))
+    names = [node.full_name for node in system.manifest.nodes]
     for path, named in readers.items():
         file = system.files.read(path)
         if not os.path.lexists(path):
@@ -201,8 +194,8 @@ def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield error("check.parameter-file", named[0][1], message, nearest_file(Path(path)))
             continue
         yield from file.flaws
-        for node, at in () if file.flaws else named:
-            if not any(section.matches(node.full_name) for section in file.sections):
+        for node, at, takers in () if file.flaws else named:
+            if not any(section.matches(name) for section in file.sections for name in takers):
                 listed = ", ".join(repr(each.pattern) for each in file.sections) or "no node"
                 message = (
                     f"cannot find node {node.full_name!r} in {file.shown!r}: it is for {listed}"
@@ -210,41 +203,12 @@ def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 hint = f"name the section {node.full_name}, or /** for every node"
                 yield warning("check.parameter-file-unmatched", at, message, hint)
             yield from _values(file, node)
-        yield from _unmatched_sections(file, system)
-        yield from _unknown_to_all(file, [node for node, _ in named])
-
-
-def check_files_of_command(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
-    """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
-    paths = [each.file for each in command_line_parameters(node) if each.file]
-    if not paths:
-        return
-    every = [each.full_name for each in system.manifest.nodes]
-    names = [each.full_name for each in system.processes[node.process_name]]
-    for file in map(system.files.read, paths):
-        mine = [each for each in file.sections if any(map(each.matches, names))]
-        # One file for many processes has sections for the nodes of others.
-        for section in file.sections:
-            if not mine or not any(map(section.matches, every)):
-                message = (
-                    f"cannot use the parameters of {section.pattern!r} in {file.shown!r}: no node "
-                    f"of the process of {node.key!r} has that name"
-                )
-                hint = did_you_mean(section.pattern, names)
-                at = node.where("run.command")
-                yield warning("check.parameter-file-unmatched", at, message, hint)
-
-
-def _unmatched_sections(file: ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Warn of sections that match no node in a file of which others do: most are misspelt."""
-    names = [node.full_name for node in system.manifest.nodes]
-    dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
-    if len(dead) == len(file.sections):
-        return  # reported where the file is named
-    for section in dead:
-        message = f"cannot use the parameters of {section.pattern!r}: no node has that name"
-        hint = did_you_mean(section.pattern, names)
-        yield warning("check.parameter-file-unmatched", section.at, message, hint)
+        dead = [each for each in file.sections if not any(map(each.matches, names))]
+        for section in dead if len(dead) < len(file.sections) else ():  # else reported above
+            message = f"cannot use the parameters of {section.pattern!r}: no node has that name"
+            hint = did_you_mean(section.pattern, names)
+            yield warning("check.parameter-file-unmatched", section.at, message, hint)
+        yield from _unknown_to_all(file, [node for node, _, _ in named])
 
 
 def _values(file: ParameterFile, node: Node) -> Iterator[Diagnostic]:
@@ -281,4 +245,4 @@ def _unknown_to_all(file: ParameterFile, readers: list[Node]) -> Iterator[Diagno
 
 
 CHECKS = (check_parameter_files, check_mode_parameters)
-OF_A_NODE = (check_parameters, check_unused, check_files_of_command)
+OF_A_NODE = (check_parameters,)

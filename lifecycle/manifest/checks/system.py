@@ -9,14 +9,14 @@ event), so that what connects to them is not reported as unconnected. Pure.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity, error, note, warning
+from lifecycle.manifest.diagnostics import Diagnostic, Position, error, warning
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
@@ -64,11 +64,6 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
     def at(self) -> Position:
         """Where the endpoint is declared."""
         return self.endpoint.at
-
-    @property
-    def unmapped(self) -> str:
-        """The name before remapping, fully qualified."""
-        return expand(self.endpoint.name, self.node.name, self.node.namespace)
 
     def __str__(self) -> str:
         noun = self.endpoint.kind.noun
@@ -264,48 +259,50 @@ def check_duplicate_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
         first: dict[str, Resolved] = {}
         for each in group:
             other = first.setdefault(each.node.key, each)
-            # A rule that gave one of them its name is reported by `check_remaps`.
-            if other is not each and each.unmapped == other.unmapped == name:
+            if other is not each:
                 message = (
                     f"cannot have two {kind.noun}s {name!r} in one node: "
                     f"{other.endpoint.name!r} is the same ({other.at.spelled})"
                 )
-                yield error("check.duplicate-endpoint", each.at, message, "remove one")
-        one, *others = first.values()
-        for each in others if kind.value.endswith("_servers") else ():
-            message = (
-                f"cannot tell which of {len(first)} servers answers {name!r}: {one} offers it as "
-                "well"
-            )
-            hint = "move one of them with 'namespace:' or 'remap:'"
-            yield note("check.several-servers", each.at, message, hint)
+                hint = "remove one, or remap one of them"
+                yield error("check.duplicate-endpoint", each.at, message, hint)
 
 
-def check_remaps(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
+def check_remaps(_system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Yield findings about the remap rules of a node."""
     names = _graph_names(node)
-    fitting: dict[tuple[str, RemapKind], str] = {}  # the match that renames what has this name
+    actions = [
+        _expanded(node, each.name) for each in node.interface.endpoints if each.kind.is_action
+    ]
     for (match, _), rule in read_rules(node):
         at = node.where(f"remap.{match}")
         if isinstance(rule, LifecycleError):
             yield error("check.remap-rule", at, rule.message, rule.hint)
-        elif rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
+            continue
+        if rule.kind in (RemapKind.NODE_NAME, RemapKind.NAMESPACE):
             key = "name" if rule.kind is RemapKind.NODE_NAME else "namespace"
             message = f"cannot remap {match!r} here: the manifest says who the node is"
             yield error("check.remap-identity", at, message, f"write '{key}: {rule.replacement}'")
+            continue
+        wanted = _expanded(node, rule.match)
+        known = [name for name, kind in names if rule.applies_to(kind, node.name)]
+        # A rule for many nodes is one for those that have the name.
+        if not wanted or wanted in known or f"remap.{match}" in node.shared:
+            continue
+        if rule.node not in ("", node.name):
+            why, hint = f"it is for node {rule.node!r}, this one is {node.name!r}", "remove it"
+        elif wanted in actions:
+            why = "rcl remaps only the hidden topics and services of an action"
+            hint = (
+                f"remap {match}/_action/send_goal, …/cancel_goal, …/get_result, …/feedback and "
+                "…/status, or declare the action by its final name"
+            )
+        elif node.endpoints is EndpointPolicy.DECLARED:
+            why = f"no endpoint of the node is named {wanted!r}"
+            hint = did_you_mean(wanted, known)
         else:
-            wanted, is_used = _expanded(node, rule.match), False
-            for name, kind in names:
-                if rule.applies_to(kind, node.name) and wanted and wanted == name:
-                    is_used |= fitting.setdefault((name, kind), match) == match
-            if wanted and not is_used:
-                found = _unused(node, match, rule, names)
-                # A rule for many nodes is one for those that have the name.
-                if found and (
-                    found.severity is Severity.ERROR or f"remap.{match}" not in node.shared
-                ):
-                    yield found
-    yield from _collisions(node, system.by_node.get(node.key, ()))
+            continue
+        yield warning("check.remap-unused", at, f"cannot apply the rule {match!r}: {why}", hint)
 
 
 def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
@@ -326,62 +323,6 @@ def _expanded(node: Node, name: str) -> str:
         return expand(name, node.name, node.namespace)
     except LifecycleError:
         return ""
-
-
-def _unused(
-    node: Node, match: str, rule: RemapRule, names: list[tuple[str, RemapKind]]
-) -> Diagnostic | None:
-    """Return why a rule renames nothing; None where a node may have more than it declares."""
-    at, wanted = node.where(f"remap.{match}"), _expanded(node, rule.match)
-    if rule.node not in ("", node.name):
-        message = (
-            f"cannot apply the rule {match!r}: it is for node {rule.node!r}, "
-            f"this one is {node.name!r}"
-        )
-        return warning("check.remap-unused", at, message, "remove the prefix, or the rule")
-    actions = [each.name for each in node.interface.endpoints if each.kind.is_action]
-    if any(_expanded(node, name) == wanted for name in actions):
-        return error(
-            "check.remap-action",
-            at,
-            f"cannot remap the action {wanted!r}: rcl remaps its hidden topics and services only",
-            f"remap {match}/_action/send_goal, …/cancel_goal, …/get_result, …/feedback and "
-            "…/status, or declare the action by its final name",
-        )
-    known = [name for name, kind in names if kind & rule.kind]
-    if wanted in known:
-        message = f"cannot apply the rule {match!r}: an earlier rule for {wanted!r} always wins"
-        return warning("check.remap-shadowed", at, message, "remove one of the two")
-    if node.endpoints is not EndpointPolicy.DECLARED:
-        return None
-    message = f"cannot apply the rule {match!r}: no endpoint of the node is named {wanted!r}"
-    return warning("check.remap-unused", at, message, did_you_mean(wanted, known))
-
-
-def _collisions(node: Node, resolved: Iterable[Resolved]) -> Iterator[Diagnostic]:
-    """Refuse a rule that gives an endpoint the name of another one of its kind and node."""
-    first: dict[tuple[EndpointKind, str], Resolved] = {}
-    for each in resolved:
-        other = first.setdefault((each.endpoint.kind, each.name), each)
-        if other is each or each.unmapped == other.unmapped == each.name:
-            continue
-        moved, stays = (each, other) if each.unmapped != each.name else (other, each)
-        message = (
-            f"cannot remap {each.endpoint.kind.noun} {moved.endpoint.name!r} onto {each.name!r}: "
-            f"{stays.endpoint.name!r} of the same node has that name ({stays.at.spelled})"
-        )
-        # The place of the rule that renamed it; the endpoint's if it is not plain.
-        at = next(
-            (
-                node.where(f"remap.{match}")
-                for (match, _), rule in read_rules(node)
-                if isinstance(rule, RemapRule)
-                and rule.match
-                and _expanded(node, rule.match) == moved.unmapped
-            ),
-            moved.at,
-        )
-        yield error("check.remap-collision", at, message, "remap only one of them")
 
 
 CHECKS = (check_endpoint_names, check_duplicate_nodes, check_duplicate_endpoints)

@@ -89,8 +89,7 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
         raise _refuse(file, f"cannot open {quote(str(path), limit=200)}: {reason}") from problem
     status = os.fstat(descriptor)
     kind = "" if stat.S_ISREG(status.st_mode) else "a special file"
-    for is_of_kind, name in _KINDS:
-        kind = name if is_of_kind(status.st_mode) else kind
+    kind = "a directory" if stat.S_ISDIR(status.st_mode) else kind
     for each in ("/proc", "/sys"):
         # Every file there claims to be a regular one; reading /proc/kmsg waits, and takes away.
         with contextlib.suppress(OSError):
@@ -112,15 +111,6 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
             message = f"cannot read a file of {size} bytes; at most {MAX_BYTES} are allowed"
             raise _refuse(file, message, "split it with 'include:'")
     return data
-
-
-_KINDS = (
-    (stat.S_ISDIR, "a directory"),
-    (stat.S_ISFIFO, "a FIFO"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a character device"),
-    (stat.S_ISBLK, "a block device"),
-)
 
 
 def decode(data: bytes, *, file: str) -> str:

@@ -56,20 +56,6 @@ _WORDS: Mapping[str, tuple[int, int | None]] = {
 
 _KIND = re.compile(r"\s*([^\s()$'\"]*)")
 _SPACE = re.compile(r"\s*")
-_ELSEWHERE = {
-    "eval": "a manifest computes nothing; write $(equals A B), $(not-equals A B), $(not A), "
-    "$(and A B) or $(or A B), or have an argument give the value",
-    "var": "write $(arg NAME)",
-    "optenv": "write $(env NAME DEFAULT)",
-    "dirname": "leave it out: paths are relative to the manifest",
-    "find-pkg-prefix": "write $(find-pkg-share PACKAGE)/../..",
-    "exec-in-pkg": "write run: {package: PACKAGE, executable: EXECUTABLE}",
-    "find-exec": "write run: {command: [PROGRAM]}, which is looked for on PATH",
-    "file-content": "write $(file PATH)",
-    "anon": "write the name that the node is to have: a plan names every node",
-}
-"""What launch files have and manifests have otherwise, by what is written there."""
-
 Text = tuple["str | Substitution", ...]
 """Text of a value in its parts."""
 
@@ -136,8 +122,7 @@ def _substitution(text: str, begin: int, depth: int) -> tuple[Substitution, int]
             return Substitution(kind=kind, written=written, words=tuple(words)), at + 1
         if kind not in _WORDS or mark in ("", "(", ")"):
             whole = text[begin : _closing(text, begin)]
-            hint = _ELSEWHERE.get(kind, ALLOWED)
-            raise LifecycleError(f"cannot substitute {quote(whole)}", hint=hint)
+            raise LifecycleError(f"cannot substitute {quote(whole)}", hint=ALLOWED)
         is_quoted = mark in "'\""
         word, at = _parse(text, at + is_quoted, mark if is_quoted else " \t\r\n()", depth)
         if is_quoted and at >= len(text):

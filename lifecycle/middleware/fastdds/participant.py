@@ -209,8 +209,7 @@ class FlowParticipant:
     ) -> None:
         self.name = name
         self.settings = ParticipantSettings(**settings)
-        asked = (dscp, *(url.dscp for url in self.settings.urls))
-        self._dscp = next((each for each in asked if each is not None), None)
+        self._dscp = dscp
         self._served = served
         self._moved: list[MovedEndpoint] = []
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()

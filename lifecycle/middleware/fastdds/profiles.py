@@ -328,11 +328,10 @@ def profile(
     if table := settings.connections.static_participants:
         put(rtps, f"{_CONFIG}/EDP", "STATIC")
         put(rtps, f"{_CONFIG}/static_edp_xml_config", f"data://{endpoint_table(table)}")
-    sizes = (settings.max_datagram_bytes, *(url.max_datagram_bytes for url in settings.urls))
-    if given := [each for each in sizes if each is not None]:
+    if settings.max_datagram_bytes is not None:
         # Not maxMessageSize of a transport: it is the receive buffer's size as well, and would cut
         # what others send.
-        _set_property(rtps, "fastdds.max_message_size", str(min(given)))
+        _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
     for each in rtps.iter("discoveryProtocol") if settings.connections.super_client else ():
         if (each.text or "").strip() == "CLIENT":
             each.text = "SUPER_CLIENT"

@@ -29,9 +29,6 @@ DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1
 _TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 """What a profile calls the transports."""
 
-_SERVER_ID_BYTE = 2
-"""`fast-discovery-server -i ID` writes ID into the third byte of its GUID prefix."""
-
 _UNICAST, _GROUPS = _DATA = ("defaultUnicastLocatorList", "defaultMulticastLocatorList")
 _DISCOVERY_UNICAST, _DISCOVERY_GROUPS, _SEARCHED = _DISCOVERY = (
     "metatrafficUnicastLocatorList",
@@ -118,7 +115,7 @@ def add_transports(
         rtps: the participant's; what it said of locators and discovery is replaced by URLs.
         found: all transports that it gets.
         domain_id: 0–232, for TCP's logical ports.
-        non_blocking_send: on every UDP transport, whatever its URLs say.
+        non_blocking_send: on every UDP transport.
         localhost_peers: see `participant_profile.profile`.
     """
     urls = [url for family in found for url in family.urls]
@@ -168,8 +165,6 @@ def _described(family: UrlTransport, *, is_local: bool) -> ET.Element:
         for tag, option in (("TTL", "ttl"), ("output_port", "output_port")):
             if (value := family.option(option)) is not None:
                 put(made, tag, value)
-        if any(url.non_blocking_send for url in family.urls):
-            put(made, "non_blocking_send", "true")
     if family.kind.is_network and (family.urls or is_local):
         wide = is_local or any(peer.port is None for peer in family.peers)
         range_ = LOCALHOST_PEERS_RANGE if wide and family.kind.is_udp else 1
@@ -280,10 +275,9 @@ def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
         for index, server in enumerate(url.server):
             listened = servers
             if installed().names_servers:
-                octets = url.server_prefix.split(".")
-                server_id = int(octets[_SERVER_ID_BYTE], 16) + index
-                octets[_SERVER_ID_BYTE] = f"{server_id & 0xFF:02x}"
-                remote = ET.SubElement(servers, "RemoteServer", prefix=".".join(octets))
+                # `fast-discovery-server -i ID` writes ID into the third byte.
+                prefix = f"44.53.{index & 0xFF:02x}.5f.45.50.52.4f.53.49.4d.41"
+                remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
                 listened = child(remote, "metatrafficUnicastLocatorList")
             # A server's logical port is its physical one.
             physical = server.port if url.transport.is_tcp else None

@@ -219,7 +219,7 @@ class GraphObserver:
                 each
                 for each in shown.pop(self._name, ())
                 if each.kind not in OF_SERVICES
-                and (names.looks_for(each.kind, each.name) or names.has(each.kind, each.name))
+                and (names.fed_by(each.kind, each.name) or names.has(each.kind, each.name))
             ]
         nodes = (
             ObservedNode(full_name=name, count=count, managed=_managed(name, shown.get(name, ())))

@@ -49,8 +49,6 @@ _FACTORIES = {
 }
 """What each makes, and its positional parameters where it can be made with a flow of its own."""
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
-_UNSAID = ("undeclare_parameter", "set_descriptor")
-"""They change the parameters of a node, and rclpy publishes no event of it."""
 
 
 def initialised(
@@ -146,8 +144,6 @@ class Adoption:
             self._wrap(name, functools.partial(self._create, kind, names))
         for name in _REMOVERS:
             self._wrap(name, self._remove)
-        for name in _UNSAID:
-            self._wrap(name, self._change_parameters)
 
     def unfollow(self) -> None:
         """Take no node that is made from now on for one of the plan."""
@@ -198,14 +194,11 @@ class Adoption:
         if (foreign := self._foreign.get(id(node))) is not None:
             foreign.close()
         destroy(node)
-
-    def _change_parameters(
-        self, change: Callable[..., Any], node: Node, *arguments: Any, **options: Any
-    ) -> Any:
-        result = change(node, *arguments, **options)
-        if (foreign := self._foreign.get(id(node))) is not None:
-            foreign.configuration_changes.touch()
-        return result
+        for hosted in self.made.values():
+            if hosted.node is node and not hosted.is_destroyed:
+                hosted.is_destroyed = True
+                for listener in hosted.listeners:
+                    listener(hosted)
 
     def _add_waitable(self, add: Callable[..., None], node: Node, waitable: Any) -> None:
         self._loop.take_waitable(node, waitable)  # before its executor can look
@@ -287,27 +280,20 @@ class Adoption:
         reference = planned.run.python
         several = isinstance(returned, (list, tuple, set, frozenset))
         nodes = [each for each in (returned if several else (returned,)) if isinstance(each, Node)]
-        if planned.key not in self._constructed:
+        if planned.key not in self._constructed or not (isinstance(what, type) or nodes):
             names = ", ".join(each.get_fully_qualified_name() for each in nodes) or repr(returned)
             raise BringUpError(
-                f"cannot use {reference!r}: it made {names}, and no node for {planned.full_name}",
-                hint="return the node, or a list of nodes; the host spins them",
+                f"cannot use {reference!r}: it returned {names}, not {planned.full_name}",
+                hint="return the node, or a list of nodes; the host spins and destroys them",
             )
         known = {id(each.node) for each in self.made.values()}
         known.update(map(id, self._constructed.values()))
-        for each in nodes:
-            if id(each) not in known:
-                name = each.get_fully_qualified_name()
-                raise BringUpError(
-                    f"cannot host {name}, which {reference!r} returns: no node is declared for it "
-                    f"beside {planned.full_name}",
-                    hint=f"add a node of that name with the same `run:` and `process: "
-                    f"{planned.process}`",
-                )
-        if not isinstance(what, type) and not nodes:
+        for each in (node for node in nodes if id(node) not in known):
             raise BringUpError(
-                f"cannot use {reference!r}: it returns {returned!r} and must return its nodes",
-                hint="it must neither spin nor destroy them: the host does",
+                f"cannot host {each.get_fully_qualified_name()}, which {reference!r} returns: no "
+                f"node is declared for it beside {planned.full_name}",
+                hint="add a node of that name with the same `run:` and `process: "
+                f"{planned.process}`",
             )
 
     def _take(self, name: str, namespace: str | None) -> PlannedNode | None:

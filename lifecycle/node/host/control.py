@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import importlib
 import os
 import socket
 import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from pathlib import Path
-from types import TracebackType
 
 import msgspec
 
@@ -118,7 +115,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
             `error` says why, the process exits),
             "state" (a node's state changed), "reply", "beat" (the executor has returned from a
             callback that took too long), "configuration" (it changed: endpoints, connections,
-            mappings or matches), "measured" (every half second, of an active node).
+            mappings or matches), "measured" (every half second, of an active node), "destroyed" (by
+            its own code, in a process that goes on).
         id: the Command's id, for "reply".
         ok: the operation succeeded, for "reply".
         state: lifecycle_msgs/State label after it; empty of a plain node.
@@ -143,10 +141,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _AT_ONCE_BYTES = 1 << 16
-
-_OURS = f"{Path(__file__).parents[1]}{os.sep}"
-"""Where the host's own modules are."""
-
 
 _LAST_S = 1.0
 """For a supervisor to read what is still to be sent when a host ends."""
@@ -243,20 +237,10 @@ class HostChannel:
 
 
 def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
-    """Notify the supervisor why a node cannot be hosted, and leave the user's trace in the log."""
-    trace = _of_user(error.__traceback__)
-    if trace is not None or not isinstance(error, LifecycleError):
-        traceback.print_exception(type(error), error, trace)
+    """Notify the supervisor why a node cannot be hosted, and leave the traceback in the log."""
+    reason = str(error)
+    if not isinstance(error, LifecycleError):
+        reason = f"{type(error).__name__}: {error}"
+        traceback.print_exception(error)
         sys.stderr.flush()
-    reason = str(error) if isinstance(error, LifecycleError) else f"{type(error).__name__}: {error}"
     channel.write(Event(kind="failed", node=node, ok=False, error=reason))
-
-
-def _of_user(trace: TracebackType | None) -> TracebackType | None:
-    """Return a traceback from the first frame on that is the user's; None if all are ours."""
-    while trace is not None:
-        file = trace.tb_frame.f_code.co_filename
-        if not file.startswith((_OURS, "<frozen importlib")) and file != importlib.__file__:
-            return trace
-        trace = trace.tb_next
-    return None

@@ -105,8 +105,8 @@ class ForeignNode(NodeInHost):
 
     @property
     def reported(self) -> HostedState:
-        """Its state; a plain node has none, nor has one whose constructor still runs."""
-        if self._machine is None or not self._is_constructed:
+        """Its state; a plain node has none, nor one whose constructor runs, or is destroyed."""
+        if self._machine is None or not self._is_constructed or self.is_destroyed:
             return HostedState(label="", connected=True, steady=True)
         label = self._machine.label
         return HostedState(label=label, connected=label in _CONNECTED, steady=label in _STEADY)

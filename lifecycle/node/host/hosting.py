@@ -52,6 +52,11 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
     {Operation.ACTIVATE, Operation.DEACTIVATE, Operation.CLEANUP, Operation.SHUTDOWN}
 )
 
+_DOWNWARDS = frozenset(
+    {Operation.DEACTIVATE, Operation.DISCONNECT, Operation.CLEANUP, Operation.SHUTDOWN}
+)
+"""What is done of a node that its own code has destroyed."""
+
 _LEAVE_S = 0.5
 """For the participants of nodes that were constructed while another's module is imported."""
 
@@ -159,8 +164,7 @@ class Host:
         for hosted in self._adoption.make(planned, group, maker):
             self._nodes[hosted.full_name] = hosted
             hosted.gate.measure(self._spec.apart)
-            if hosted.spec.managed:
-                hosted.listeners.append(lambda node: self._report("state", node, node.full_name))
+            hosted.listeners.append(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
             self._note_marks(hosted)
             self._loop.add(hosted)
@@ -192,13 +196,20 @@ class Host:
                 if measured is not None:
                     self._channel.write(Event(kind="measured", node=name, measured=measured))
 
+    def _report_state(self, hosted: Hosted) -> None:
+        if hosted.is_destroyed:
+            if not self._left.is_set():
+                self._channel.write(Event(kind="destroyed", node=hosted.full_name))
+        elif hosted.spec.managed:
+            self._report("state", hosted, hosted.full_name)
+
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
         hosted = self._nodes.get(configuration.name)
         self._note_marks(hosted)
         self._report("configuration", hosted, configuration.name, configuration=configuration)
 
     def _report(self, kind: str, hosted: Hosted | None, name: str, **more: Any) -> None:
-        if hosted is not None:
+        if hosted is not None and not hosted.is_destroyed:
             state = hosted.reported
             more.update(state=state.label, connected=state.connected)
         self._channel.write(Event(kind=kind, node=name, **more))
@@ -282,7 +293,9 @@ class Host:
                 changed = command.operation is Operation.ACTIVATE and self._has_other_marks(node)
                 result = _changed(node) if changed else await self._carry_out(node, command)
                 error = result.error
-                if command.operation not in _ANSWERED_WITHOUT_CONFIGURATION or (
+                if node.is_destroyed:
+                    pass  # there is nothing to report
+                elif command.operation not in _ANSWERED_WITHOUT_CONFIGURATION or (
                     # No event reports its sockets: what its callback did to them is read now.
                     command.operation is Operation.ACTIVATE and node.full_name in self._marks
                 ):
@@ -306,6 +319,12 @@ class Host:
 
     async def _carry_out(self, node: Hosted, command: Command) -> Result:
         operation = command.operation
+        if node.is_destroyed:
+            if operation in _DOWNWARDS:
+                return SUCCESS
+            raise LifecycleError(
+                f"cannot {operation.value} {node.full_name}: its own code has destroyed it"
+            )
         if operation is Operation.SEND_AGAIN_SOON:
             send_again_soon()
         elif operation is Operation.REPUBLISH_NAMES:

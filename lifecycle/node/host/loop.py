@@ -132,6 +132,9 @@ class Heartbeat:
 
     def follow(self, hosted: Hosted) -> None:
         """A transition begins or ends: meanwhile nothing else of its group runs."""
+        if hosted.is_destroyed:
+            self.rest(hosted.node)
+            return
         with self._lock:
             if not hosted.reported.steady:
                 self._changing.add(hosted.full_name)
@@ -194,6 +197,8 @@ class NodeLoop:
                 from rclpy.experimental.events_executor import EventsExecutor
 
                 self._own = EventsExecutor(context=context)
+                # With a single node it crashes where a task raises: it indexes its set of nodes.
+                self._own.add_node(Watching())
             else:
                 count = threads or max(2, os.cpu_count() or 0)
                 self._own = MultiThreadedExecutor(count, context=context)
@@ -357,7 +362,7 @@ class NodeLoop:
         self.stop("a callback raised an exception", code=1)
 
     async def _shut_down(self, reason: str) -> None:
-        for hosted in reversed(self._hosted):
+        for hosted in reversed([each for each in self._hosted if not each.is_destroyed]):
             try:
                 await hosted.shut_down(reason)
             except Exception:  # noqa: BLE001, PERF203 - the other nodes must still be shut down

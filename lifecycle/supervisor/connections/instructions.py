@@ -38,7 +38,6 @@ from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
     PlannedEndpoint,
-    PlannedFlow,
     PlannedNode,
     PlannedParticipant,
 )
@@ -306,9 +305,9 @@ class NegotiatedSource:
         # What concerns an undeclared node is left out: the system does without it.
         keys = {each.key for each in self._plan.nodes}
         self.problems = tuple(
-            f"{each.problem}; {each.hint}" if each.hint else each.problem
+            f"{each.why.message}; {each.why.hint}" if each.why.hint else each.why.message
             for each in graph.problems
-            if {each.publisher, each.subscription} <= keys
+            if {each.flow.publisher, each.flow.subscription} <= keys
         )
         self.expected = _with_flows(with_graph(self._grown(known), graph), graph)
         instructions = dict(by_plan(self.expected))
@@ -393,13 +392,7 @@ def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
     keys = {each.key for each in plan.nodes}
     there = {(each.topic, each.publisher, each.subscription) for each in plan.flows}
     more = {
-        place: PlannedFlow(
-            topic=each.topic,
-            publisher=each.publisher,
-            subscription=each.subscription,
-            medium=each.medium,
-            medium_reason=each.reason,
-        )
+        place: each
         for each in graph.flows
         if (place := (each.topic, each.publisher, each.subscription)) not in there
         and {each.publisher, each.subscription} <= keys

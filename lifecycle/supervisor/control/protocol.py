@@ -17,7 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.measure.flows import FlowMeasurement
 from lifecycle.run_directory import (
     RunDirectory,
@@ -101,8 +101,8 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         flows: flows from or to it.
         findings: findings of the last verdict that concern it.
         silent: why nothing can be expected of it; empty while it is alive.
-        died: how its process ended unasked; empty while it runs. It then has no state, and no
-            matches.
+        died: how its process ended unasked, or that its own code destroyed it while that runs;
+            empty otherwise. It then has no state, and no matches.
         connections: as it reports them, its own participant left out.
         uptime_s: since its process was started; None while there is none of ours.
         restarts: how often its process was started again by policy.
@@ -363,10 +363,16 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
 
     Raises:
         UsageError: it runs no more, or does not answer; it was ordered nothing then.
-        TimeoutError: it is not done after `timeout_s`; it goes on all the same.
+        BringUpError: it is not done after `timeout_s`; it goes on all the same.
     """
     _check_answers(path)
-    answer = _answered(path, question, timeout_s)
+    try:
+        answer = _answered(path, question, timeout_s)
+    except TimeoutError as error:
+        raise BringUpError(
+            f"cannot {question.ask.value} {path.name!r} within {timeout_s:g} s; it is still at it",
+            hint=f"see what it does: lifecycle status {path.name}",
+        ) from error
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
         why = "it has no exit code" if code is None else f"its exit code is {code}"

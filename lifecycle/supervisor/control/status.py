@@ -48,7 +48,10 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
     run, verdict = system.run, system.run.judged.verdict
     process, known = node.process, run.processes.get(node.core.process)
     runs = known is not None and known.is_alive and process is not None and process.pid != 0
-    died = _died(run, known, 0 if process is None else process.pid)
+    pid = 0 if process is None else process.pid
+    died = _died(run, known, pid)
+    if runs and node.is_destroyed:
+        died = f"destroyed by its own code; pid {pid} runs on"
     configuration = None if died else node.configuration
     flows = [
         flow
@@ -67,7 +70,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
         node=node.name,
         process="" if external else node.planned.process,
         process_state=None if known is None else process_state(run, known),
-        pid=0 if process is None else process.pid,
+        pid=pid,
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else _state(node, verdict),

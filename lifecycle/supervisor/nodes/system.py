@@ -62,6 +62,7 @@ class NodeRun:
         unload: has its container unload a component; None for what is not loaded into one.
         wiring: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
+        is_destroyed: its own code has destroyed it, in a process that runs on.
     """
 
     def __init__(self, system: System, core: Node) -> None:
@@ -79,6 +80,7 @@ class NodeRun:
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.wiring = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
+        self.is_destroyed = False
 
     @property
     def planned(self) -> PlannedNode:
@@ -393,6 +395,8 @@ class System:
             if node.configuration is not None:  # the next look has it
                 node.configuration = replace(node.configuration, measured=event.measured)
             return
+        if event.kind == "destroyed":
+            node.is_destroyed = True
         if event.configuration is not None:
             node.configuration = event.configuration
         if event.kind != "reply" and event.state:

@@ -174,7 +174,7 @@ class ControlChannel:
                 self._ready.set_exception(failure)
         elif event.kind == "beat":
             self._on_hang(False)
-        elif event.kind in ("state", "configuration", "measured"):
+        elif event.kind in ("state", "configuration", "measured", "destroyed"):
             self._on_state(event)
 
     def _look(self) -> None:

@@ -395,10 +395,6 @@ class Emitter:
 def to_record(event: Event) -> dict[str, Any]:
     """Return `event` as the JSON object that `--format json` prints."""
     plain: dict[str, Any] = msgspec.to_builtins(event)
-    if isinstance(event, VerdictChanged):
-        from lifecycle.verify.report import plain_findings  # imports every rule
-
-        plain["verdict"]["findings"] = plain_findings(event.verdict)
     return plain
 
 

@@ -110,7 +110,7 @@ class Journal:
         if isinstance(event, LogLine):
             return
         if isinstance(event, VerdictChanged):
-            verdict = replace(event.verdict, flows=(), open_endpoints=())
+            verdict = replace(event.verdict, flows=())
             event = replace(event, verdict=verdict)
         file = self._file
         failed = file.error is not None

@@ -316,7 +316,6 @@ def capture_running(
     system: str,
     domain_id: int,
     discovery_range: DiscoveryRange,
-    namespaces: tuple[str, ...],
     wait_s: float,
     attach: bool,
 ) -> CapturedSystem:
@@ -326,7 +325,6 @@ def capture_running(
         system: name to give it.
         domain_id: 0–232.
         discovery_range: how far to look.
-        namespaces: take only nodes in or below one of these; empty takes all.
         wait_s: seconds, > 0, that discovery may take to settle.
         attach: do not look how the processes of this host were started.
 
@@ -367,7 +365,6 @@ def capture_running(
                 system=system,
                 domain_id=domain_id,
                 discovery_range=discovery_range,
-                namespaces=namespaces,
                 unsettled=unsettled,
                 programs=note_ended(programs),
             )

@@ -8,12 +8,11 @@ Code that acts on findings asks their rules and does not parse ids, subjects or 
 from __future__ import annotations
 
 import enum
-import functools
+from typing import Any
 
 import msgspec
 
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
@@ -45,17 +44,17 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
         meaning: what a finding of it says, one line.
         fix: what to do about it, one line.
         outcomes: the outcomes that it can have besides ok.
+        says: message of a violated finding, made of `{who}`, `{expected}` and `{observed}`.
+        unproven: likewise of an unverifiable one.
         concerns_flow: a finding on an endpoint also spoils the flows of that endpoint.
         may_block: False for a rule whose unverifiable findings never close the gate, because the
             manifest waived the requirement itself.
         heals: what takes its findings back.
         about: what it looks at that a node brings along; None for anything else.
         if_undiscovered: it breaks where one participant does not discover another.
-        absence: for a rule whose violated findings say that something is not there (yet), how to
-            call that, with `{kind}` of the endpoint and `{node}`; empty for others.
         awaits: for a rule whose findings say that something is not known (yet), the rule that is
             broken while what would show it is not there; None for others.
-        names_expected: its subjects mean nothing without what was expected of them.
+        numbers: it is about a declared number, without which its subjects mean nothing.
         measured: it compares what is declared with what has arrived: it never closes a gate.
         names_log: its fix is in a log, and ends in the name of the file where that is known.
     """
@@ -64,14 +63,15 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     meaning: str
     fix: str
     outcomes: tuple[Outcome, ...] = (Outcome.VIOLATED,)
+    says: str = "{who} is {observed}, and must be {expected}"
+    unproven: str = "nothing shows that {who} is {expected}: {observed}"
     concerns_flow: bool = False
     may_block: bool = True
     heals: Heals = Heals.WITH_CHANGE
     about: About | None = None
     if_undiscovered: bool = False
-    absence: str = ""
     awaits: Rule | None = None
-    names_expected: bool = False
+    numbers: bool = False
     names_log: bool = False
     measured: bool = False
 
@@ -86,17 +86,17 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
         subject: str,
         expected: str,
         observed: str,
-        message: str,
         outcome: Outcome | None = None,
+        who: str = "",
+        message: str = "",
         at: Position | None = None,
-        node: str = "",
-        endpoint: EndpointKind | None = None,
         hint: str = "",
-        ends: tuple[str, ...] = (),
+        **fields: Any,
     ) -> Finding:
         """Make a finding of this rule, with the only outcome that it has where none is given.
 
-        `hint` defaults to the rule's fix.
+        `message` is made of `says` and `who`, which defaults to the subject; `hint` defaults to the
+        rule's fix. `fields`: others of Finding.
 
         Raises:
             ValueError: the rule is not documented to have this outcome, or has several.
@@ -105,45 +105,31 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
             (outcome,) = self.outcomes
         if outcome not in self.outcomes:
             raise ValueError(f"cannot give rule {self.id} the outcome {outcome.value}")
+        says = self.says if outcome is Outcome.VIOLATED else self.unproven
+        words = {"who": who or subject, "expected": expected, "observed": observed}
         return Finding(
             rule=self.id,
             outcome=outcome,
             subject=subject,
             expected=expected,
             observed=observed,
-            message=message,
+            message=message or says.format_map(words),
             at=at.spelled if at else "",
-            node=node,
-            endpoint=endpoint,
             hint=hint or self.fix,
-            ends=ends,
+            **fields,
         )
 
-    def on(
-        self,
-        what: PlannedNode | Actual | FlowView,
-        *,
-        expected: str,
-        observed: str,
-        message: str,
-        outcome: Outcome | None = None,
-        hint: str = "",
-    ) -> Finding:
+    def on(self, what: PlannedNode | Actual | FlowView, **fields: Any) -> Finding:
         """Make a finding on a declared node, endpoint or flow, at its declaration; as `finding`."""
-        found = functools.partial(
-            self.finding,
-            expected=expected,
-            observed=observed,
-            message=message,
-            outcome=outcome,
-            hint=hint,
-            at=what.at,
-        )
         if isinstance(what, FlowView):
-            return found(subject=what.subject, ends=what.ends)
-        if isinstance(what, PlannedNode):
-            return found(subject=what.full_name, node=what.full_name)
-        return found(subject=what.name, node=what.node, endpoint=what.kind)
+            named: dict[str, Any] = {"subject": what.subject, "who": what.where, "ends": what.ends}
+        elif isinstance(what, PlannedNode):
+            name = what.full_name
+            named = {"subject": name, "who": f"node {name}", "node": name}
+        else:
+            end = {"node": what.node, "endpoint": what.kind}
+            named = {"subject": what.name, "who": what.where, **end}
+        return self.finding(**{"at": what.at, **named, **fields})
 
 
 PROCESS_DIED = Rule(

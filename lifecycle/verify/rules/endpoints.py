@@ -10,27 +10,28 @@ it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest.names import SUPERVISORS
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.nodes import MISSING_NODE
-from lifecycle.verify.tool_filter import action_part, of_supervisors, part_type
+from lifecycle.verify.tool_filter import action_part, is_of_observer, part_type
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import Actual, SeenEndpoint, View
+from lifecycle.verify.view import Actual, SeenEndpoint, View, Whose
 
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
     meaning="a declared endpoint is not in the graph",
+    says="{who} is declared, and is {observed}",
     fix="compare the declared name, remaps and namespace with what the node creates",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
-    absence="{kind} of {node}",
 )
 TYPE_MISMATCH = Rule(
     id="graph.type-mismatch",
@@ -41,6 +42,7 @@ TYPE_MISMATCH = Rule(
 ENDPOINT_ERROR = Rule(
     id="endpoint.error",
     meaning="a node reports that it could not make an endpoint as asked",
+    says="{who} could not be made: {observed}",
     fix="read the reason: it is the middleware's own",
     concerns_flow=True,
 )
@@ -59,6 +61,7 @@ UNDECLARED = {
         meaning=f"a declared node has {'an' if kind.noun.startswith('a') else 'a'} {kind.noun}"
         " that the manifest does not declare"
         + (", or a tool has one under a declared name" if kind.offers else ""),
+        says="the manifest does not declare {who}",
         fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
     )
     for kind in EndpointKind
@@ -67,14 +70,11 @@ UNDECLARED = {
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence, the type, and its definition, of endpoints; then those of outsiders."""
-    known: Counter[tuple[str, EndpointKind | None]] = Counter()
-    if any(actual.unseen for actual in view.actual):
-        known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
     for facts in view.nodes.values():
         for actual in facts.actual:
             yield from _declared(actual, absent=facts.absent)
             if actual.unseen and not facts.absent:
-                yield from _unseen(view, actual, known)
+                yield from _unseen(view, actual)
     yield from _undeclared(view)
     yield from _conflicts(view)
     yield from _definitions(view)
@@ -84,30 +84,16 @@ def check(view: View) -> Iterator[Finding]:
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
-    node, planned, word = actual.node, actual.planned, actual.kind.noun
     if actual.report is not None and actual.report.error:
-        yield ENDPOINT_ERROR.on(
-            actual,
-            expected=f"{word} of {node}",
-            observed=actual.report.error,
-            message=f"{node} could not make its {word} {planned.name!r}: {actual.report.error}",
-        )
+        yield ENDPOINT_ERROR.on(actual, expected="made as asked", observed=actual.report.error)
     elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
         yield MISSING_ENDPOINT.on(
-            actual,
-            expected=f"{word} of {node}",
-            observed=f"no such {word}",
-            message=f"{node} has no {word} of {actual.name}, which is declared",
-            hint=_remapped(actual),
+            actual, expected="in the graph", observed="not there", hint=_remapped(actual)
         )
     seen = actual.observed or actual.report
-    if seen is not None and seen.type != planned.type:
+    if seen is not None and seen.type != actual.planned.type:
         yield TYPE_MISMATCH.on(
-            actual,
-            expected=planned.type,
-            observed=seen.type or "no type",
-            message=f"{actual.where} is declared as {planned.type} and is"
-            f" {seen.type or 'of unknown type'}",
+            actual, expected=actual.planned.type, observed=seen.type or "of unknown type"
         )
 
 
@@ -122,9 +108,7 @@ def _remapped(actual: Actual) -> str:
     )
 
 
-def _unseen(
-    view: View, actual: Actual, known_ends: Counter[tuple[str, EndpointKind | None]]
-) -> Iterator[Finding]:
+def _unseen(view: View, actual: Actual) -> Iterator[Finding]:
     """What discovery does not show is proven by its node's report and by matched counts."""
     report = actual.report
     if report is None:
@@ -134,21 +118,18 @@ def _unseen(
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = known_ends[actual.name, actual.kind.other_end]
+        publishers, subscriptions = view.topics.get(actual.name, ((), ()))
+        ends = subscriptions if actual.kind is EndpointKind.PUBLISHER else publishers
+        known = sum(each.whose is not Whose.DEPARTED for each in ends)
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return
         reason = f"it is matched with {report.matched}, of which {known} are known here"
-    yield UNSEEN_ENDPOINT.on(
-        actual,
-        expected=f"{actual.kind.noun} of {actual.node}",
-        observed="not shown by discovery",
-        message=f"nothing shows {actual.where}: {reason}",
-    )
+    yield UNSEEN_ENDPOINT.on(actual, expected="in the graph", observed=reason)
 
 
 def _undeclared(view: View) -> Iterator[Finding]:
-    for endpoint in view.undeclared:
+    for endpoint in view.of(Whose.UNDECLARED):
         node = view.planned[endpoint.node]
         wrong = _wrong_part(view, endpoint)
         if wrong is not None:
@@ -156,7 +137,6 @@ def _undeclared(view: View) -> Iterator[Finding]:
             continue
         if node.endpoint_policy is EndpointPolicy.OPEN:
             continue
-        word = endpoint.kind.noun
         similar = [
             each.planned
             for each in view.nodes[endpoint.node].actual
@@ -167,20 +147,25 @@ def _undeclared(view: View) -> Iterator[Finding]:
         hint = ""
         if len(similar) == 1:
             hint = f"{similar[0].resolved} of the same type is missing: is a remap or a name wrong?"
-        yield UNDECLARED[endpoint.kind].finding(
-            subject=endpoint.name,
-            expected=f"no such {word} of {endpoint.node}",
-            observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
-            message=f"the manifest does not declare the {word} of {endpoint.name} in"
-            f" {endpoint.node}",
-            at=node.at,
-            node=endpoint.node,
-            endpoint=endpoint.kind,
-            hint=hint,
-        )
+        yield _not_declared(endpoint, at=node.at, hint=hint)
 
 
-def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
+def _not_declared(endpoint: SeenEndpoint, **fields: Any) -> Finding:
+    word = endpoint.kind.noun
+    return UNDECLARED[endpoint.kind].finding(
+        **_named(endpoint),
+        expected=f"no such {word}",
+        observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
+        **fields,
+    )
+
+
+def _named(end: SeenEndpoint) -> dict[str, Any]:
+    """Return what a finding is on that is on an endpoint, declared or not."""
+    return {"subject": end.name, "who": end.where, "node": end.node, "endpoint": end.kind}
+
+
+def _wrong_part(view: View, endpoint: SeenEndpoint) -> Finding | None:
     """Judge a part of an action that its node declares; None for everything else."""
     part = action_part(endpoint.kind, endpoint.name)
     if part is None:
@@ -192,10 +177,9 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
         if endpoint.type != expected:
             return TYPE_MISMATCH.on(
                 actual,
+                who=f"{endpoint.name} of {actual.where}",
                 expected=expected,
-                observed=endpoint.type or "no type",
-                message=f"{actual.where} has another type: {endpoint.name} must be {expected}"
-                f" and is {endpoint.type or 'of unknown type'}",
+                observed=endpoint.type or "of unknown type",
             )
     return None
 
@@ -203,25 +187,15 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
     types = {(each.kind.meets_in, each.name): each.planned.type for each in view.actual}
-    others = (*view.undeclared, *view.foreign, *view.unattributed)
-    undeclared = (
-        *(each for each in view.seen if each.planned is None),
-        *(SeenEndpoint.of(each) for each in others if not each.kind.is_topic),
-    )
-    for seen in undeclared:
+    for seen in view.of(Whose.UNDECLARED, Whose.TWIN, Whose.FOREIGN, Whose.UNKNOWN):
         what = seen.kind.meets_in
         declared = types.get((what, seen.name), seen.type)
         if seen.type == declared:
             continue
         yield TYPE_MISMATCH.finding(
-            subject=seen.name,
-            expected=declared,
-            observed=seen.type or "no type",
-            message=f"{seen.where} matches none: it is"
-            f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
-            f" {declared}",
-            node=seen.node,
-            endpoint=seen.kind,
+            **_named(seen),
+            expected=f"{declared}, as the manifest declares the {what}",
+            observed=seen.type or "of unknown type",
         )
 
 
@@ -229,6 +203,9 @@ DEFINITION_DIFFERS = Rule(
     id="graph.type-definition-differs",
     meaning="an endpoint's type has the declared name and another definition",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="{who} is of another definition, {observed}, and must be of {expected}: it is matched, and"
+    " the data are not understood",
+    unproven="nothing shows which definitions {who}: it announces {observed}",
     fix="build both ends from one version of the interface package, and install the same here",
     concerns_flow=True,
 )
@@ -236,6 +213,8 @@ UNATTRIBUTED_ENDPOINT = Rule(
     id="graph.unattributed-endpoint",
     meaning="the graph has an endpoint whose node is not known",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="no known node has {who}",
+    unproven="no known node has {who}",
     fix="wait for discovery; a plain DDS program has no node name: give it another domain",
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
@@ -262,14 +241,15 @@ def _definitions(view: View) -> Iterator[Finding]:
     for place, ends in _ends(view).items():
         if place not in installed:
             continue  # nothing of the plan meets there, or its type is wrong: that is said
-        expected, source = installed[place], "the definition installed here"
+        expected, source = installed[place], "installed here"
         if not expected:
             # A stranger that differs is at fault itself, so declared ends come first.
             by_right = sorted(ends, key=lambda end: end.planned is None)
             first = next((end for end in by_right if end.type_hash), None)
             if first is None:
                 continue  # nothing to compare with
-            expected, source = first.type_hash or "", first.node or "an unknown node"
+            expected = first.type_hash or ""
+            source = f"that of {first.node or 'an unknown node'}"
         for end in ends:
             if end.type_hash == "":
                 unknown.setdefault(end.node, []).append(end)
@@ -283,15 +263,12 @@ def _definitions(view: View) -> Iterator[Finding]:
 def _ends(view: View) -> dict[_Place, list[SeenEndpoint]]:
     """Return the ends of all topics, services and actions by where they meet.
 
-    Those of topics come first, by topic, then those of services and actions.
+    What tools have of topics is their own matter.
     """
-    others = (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed)
-    services = (
-        *(each for each in view.actual if each.observed is not None),
-        *map(SeenEndpoint.of, others),
-    )
     found: dict[_Place, list[SeenEndpoint]] = {}
-    for end in (*view.seen, *(each for each in services if not each.kind.is_topic)):
+    declared = (each for each in view.actual if each.observed is not None or each.beyond)
+    others = (each for each in view.others if not (each.is_passing and each.kind.is_topic))
+    for end in (*declared, *others):
         found.setdefault(_place(end), []).append(end)
     return found
 
@@ -318,18 +295,12 @@ def _at(end: SeenEndpoint) -> Position | None:
 
 
 def _differs(end: SeenEndpoint, expected: str, source: str) -> Finding:
-    what, name, type_ = _place(end)
     return DEFINITION_DIFFERS.finding(
+        **_named(end),
         outcome=Outcome.VIOLATED,
-        subject=name,
-        expected=f"{type_} as {expected}",
-        observed=f"{type_} as {end.type_hash}",
-        message=f"{end.where} has another definition: its {type_} is"
-        f" not that of {source}; both have the name, so the {what} is matched and the data are not"
-        " understood",
+        expected=f"{end.type} as {expected}, which is {source}",
+        observed=f"{end.type} as {end.type_hash}",
         at=_at(end),
-        node=end.node,
-        endpoint=end.kind,
     )
 
 
@@ -340,58 +311,25 @@ def _unverifiable(node: str, ends: list[SeenEndpoint]) -> Finding:
     return DEFINITION_DIFFERS.finding(
         outcome=Outcome.UNVERIFIABLE,
         subject=who,
+        who=f"{who} uses on {listed}",
         expected="a type hash",
-        observed="none announced",
-        message=f"nothing shows which definitions {who} uses on {listed}: it announces no type"
-        " hashes",
+        observed="no type hash",
         at=next(filter(None, map(_at, ends)), None),
         node=node,
         hint="ROS 2 announces them since Iron; run the node under a newer one, or accept the gap",
     )
 
 
-_GUID_DIGITS = 32
-_VENDORS = {
-    0x0101: "RTI Connext DDS",
-    0x0102: "OpenSplice DDS",
-    0x0103: "OpenDDS",
-    0x0106: "InterCOM DDS",
-    0x0107: "CoreDX DDS",
-    0x0109: "RTI Connext Micro",
-    0x010A: "Vortex Cafe",
-    0x010D: "Vortex Lite",
-    0x010F: "Fast DDS",
-    0x0110: "Cyclone DDS",
-    0x0111: "GurumDDS",
-    0x0112: "RustDDS",
-    0x0114: "Dust DDS",
-}
-"""By the vendor id that a GUID prefix begins with (DDSI-RTPS §9.3.1.5, dds-foundation.org)."""
-
-
 def _offered_by_tools(view: View) -> Iterator[Finding]:
-    supervisors = of_supervisors(view.plan, view.of_tools)
-    for endpoint in view.of_tools:
-        if endpoint in supervisors or not view.names.fed_by(endpoint.kind, endpoint.name):
+    for each in view.of(Whose.TOOL):
+        if not view.names.fed_by(each.kind, each.name):
             continue
-        word = endpoint.kind.noun
-        of_supervisor = (endpoint.kind, endpoint.name) in view.names.of_supervisors
-        verb = "feeds" if endpoint.kind.is_topic else "serves"
-        whom = "whoever asks for the supervisor" if of_supervisor else "the system"
-        yield UNDECLARED[endpoint.kind].finding(
-            subject=endpoint.name,
-            expected=f"no such {word} of {endpoint.node}",
-            observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
-            message=f"the manifest does not declare the {word} of {endpoint.name} in"
-            f" {endpoint.node}, which {verb} {whom}",
-            node=endpoint.node,
-            endpoint=endpoint.kind,
-            hint="only the supervisor of this system offers it; if several nodes do, none is taken"
-            " for the supervisor: stop those that are not"
-            if of_supervisor
-            else f"policy.tolerated_nodes ({view.tools[endpoint.node]}) lets it listen only: stop"
-            " it, or declare its node",
-        )
+        if not is_of_observer(each.kind, each.node, each.name, each.type):
+            yield _not_declared(
+                each,
+                hint=f"policy.tolerated_nodes ({view.tools[each.node]}) lets it listen only: stop"
+                " it, or declare its node",
+            )
 
 
 def _unattributed(view: View) -> Iterator[Finding]:
@@ -399,30 +337,26 @@ def _unattributed(view: View) -> Iterator[Finding]:
 
     After it, who only listens may be a tool whose name has yet to come; who feeds may not.
     """
-    for endpoint in view.unattributed:
+    for endpoint in view.of(Whose.UNKNOWN):
         word = endpoint.kind.noun
-        place, names = (endpoint.kind, endpoint.name), view.names
         # The supervisor of another machine begins to offer what is its own after its gate.
-        feeds = names.fed_by(*place) and place not in names.of_supervisors
+        its_own = endpoint.name.startswith(SUPERVISORS)
+        feeds = view.names.fed_by(endpoint.kind, endpoint.name) and not its_own
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
             outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
             subject=endpoint.name,
-            expected=f"{word} of a declared node",
-            observed=f"{word} of an unknown node",
-            message=f"no known node has this {word} of {endpoint.name}{described(endpoint)}",
+            who=f"this {word} of {endpoint.name}{_described(endpoint.observed)}",
+            expected="that of a declared node",
+            observed="that of an unknown node",
             endpoint=endpoint.kind,
         )
 
 
-def described(endpoint: ObservedEndpoint) -> str:
-    """Describe an endpoint's participant as far as known: vendor, address, GID; else empty."""
-    known = []
-    vendor = int(endpoint.gid[:4], 16) if len(endpoint.gid) == _GUID_DIGITS else 0
-    if vendor:
-        known.append(f"a participant of {_VENDORS.get(vendor, f'DDS vendor {vendor:#06x}')}")
-    if endpoint.address:
-        known.append(f"at {endpoint.address}")
-    if endpoint.gid:
-        known.append(f"GID {endpoint.gid}")
+def _described(endpoint: ObservedEndpoint | None) -> str:
+    """Describe an endpoint's participant as far as it is known: address, GID; else empty."""
+    if endpoint is None:
+        return ""
+    known = [f"at {endpoint.address}"] if endpoint.address else []
+    known += [f"GID {endpoint.gid}"] if endpoint.gid else []
     return f" ({', '.join(known)})" if known else ""

@@ -20,7 +20,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport, UniqueHow
+from lifecycle.manifest.model import FlowTransport, UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, UniqueRequirement
@@ -41,21 +41,26 @@ MISSING_CONNECTION = _of_connections(
     id="connection.missing",
     meaning="a planned connection of a node does not exist",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="{who} has {observed}, and must have {expected}",
+    unproven="nothing shows that {who} has {expected}: {observed}",
     fix="see who was to make it: the node at connect, or the supervisor by connect_to",
 )
 FAILED_CONNECTION = _of_connections(
     id="connection.failed",
     meaning="a node reports that it could not make a connection",
+    says="{who} has no {expected}: {observed}",
     fix="read the reason: addresses and ports of a URL must be free on the node's own machine",
 )
 OTHER_CONNECTION = _of_connections(
     id="connection.differs",
     meaning="a connection was made to other URLs than planned",
+    says="{who} is connected to {observed}, and must be to {expected}",
     fix="see who called connect_to; disconnect it, and let its authority make it again",
 )
 WRONG_MAPPING = _of_connections(
     id="connection.wrong-mapping",
     meaning="an endpoint is mapped onto another connection than planned",
+    says="{who} is mapped onto {observed}, and must be onto {expected}",
     fix="see who called map_to; map it back, or change the node's `connections`",
 )
 
@@ -85,36 +90,26 @@ def _connection(
     facts: NodeFacts, name: str, planned: ParticipantConnections, first_port: int
 ) -> Iterator[Finding]:
     node, configuration = facts.node, facts.configuration
+    expected = f"connection {name!r} ({', '.join(planned.urls)})"
     if configuration is None:
-        if facts.is_ours:
-            return  # that it does not report is said
-        yield MISSING_CONNECTION.on(
-            node,
-            outcome=Outcome.UNVERIFIABLE,
-            expected=f"connection {name}",
-            observed="unknown",
-            message=f"nothing shows connection {name!r} of {node.full_name}: the node does not"
-            " report its connections",
-        )
+        if not facts.is_ours:  # of ours it is said that it does not report
+            yield MISSING_CONNECTION.on(
+                node,
+                outcome=Outcome.UNVERIFIABLE,
+                expected=expected,
+                observed="the node does not report its connections",
+            )
         return
     report = next((each for each in configuration.connections if each.name == name), None)
     if report is None:
         yield MISSING_CONNECTION.on(
             node,
             outcome=Outcome.VIOLATED,
-            expected=f"connection {name}",
+            expected=expected,
             observed=_listed(configuration.connections),
-            message=f"{node.full_name} has no connection {name!r};"
-            f" it has {_listed(configuration.connections)}",
         )
     elif report.error:
-        yield FAILED_CONNECTION.on(
-            node,
-            expected=f"connection {name}",
-            observed=report.error,
-            message=f"{node.full_name} is not connected to {name!r}"
-            f" ({', '.join(report.urls or planned.urls)}): {report.error}",
-        )
+        yield FAILED_CONNECTION.on(node, expected=expected, observed=report.error)
     else:
         yield from _urls(node, report, planned, first_port)
 
@@ -130,10 +125,9 @@ def _urls(
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield OTHER_CONNECTION.on(
         node,
+        who=f"{what} of {node.full_name}",
         expected=", ".join(planned.urls),
         observed=", ".join(report.urls) or "no URL",
-        message=f"{what} of {node.full_name} was made to"
-        f" {', '.join(report.urls) or 'no URL'} and must be to {', '.join(planned.urls)}",
     )
 
 
@@ -142,15 +136,12 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
     if report is None or report.error or not report.mapped:
         return  # that is judged as an endpoint
     wanted = connection_of(actual.owner, actual.planned)
-    if report.connection == wanted:
-        return
-    yield WRONG_MAPPING.on(
-        actual,
-        expected=_spell_connection(wanted),
-        observed=_spell_connection(report.connection),
-        message=f"{actual.where} is mapped onto {_spell_connection(report.connection)}"
-        f" and must be onto {_spell_connection(wanted)}",
-    )
+    if report.connection != wanted:
+        yield WRONG_MAPPING.on(
+            actual,
+            expected=_spell_connection(wanted),
+            observed=_spell_connection(report.connection),
+        )
 
 
 def _spell_connection(connection: str) -> str:
@@ -164,6 +155,7 @@ def _listed(connections: Sequence[ConnectionReport]) -> str:
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
     meaning="an endpoint or a link needs a unique network flow and does not have it",
+    says="{who} must have {expected}, and {observed}",
     fix="ask for `unique:` on the endpoint itself, so that it gets sockets of its own; see"
     " `lifecycle flows`",
     concerns_flow=True,
@@ -171,18 +163,12 @@ NOT_UNIQUE = Rule(
 UNVERIFIABLE = Rule(
     id="flow.unverifiable",
     meaning="a unique network flow is strictly required or demanded and cannot be proven",
+    says="{who} must have {expected}, which is not proven: {observed}",
     fix="run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
     " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
     awaits=MISSING_REPORT,  # nothing else could prove it
-)
-BROKEN_ENDPOINT = Rule(
-    id="flow.broken-endpoint",
-    meaning="a subscription has no network flow endpoint at all, so nothing can reach it",
-    fix="look for two processes with the same fixed ports, or an interface whitelist that matches"
-    " no interface",
-    concerns_flow=True,
 )
 
 
@@ -192,7 +178,6 @@ def check(view: View) -> Iterator[Finding]:
     for facts in view.nodes.values():
         yield from _judge_connections(facts, first_port)
     for actual in view.actual:
-        yield from _broken(actual)
         if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
             yield from _strict(actual, view.uniqueness)
     for flow in view.flows:
@@ -211,64 +196,33 @@ def is_missing(flow: FlowView) -> bool:
     return any(end.observed is None and end.report is None for end in flow.endpoints)
 
 
-def _broken(actual: Actual) -> Iterator[Finding]:
-    report = actual.report
-    if actual.kind is not EndpointKind.SUBSCRIPTION or report is None or report.error:
-        return
-    if report.nfes == ():
-        yield BROKEN_ENDPOINT.on(
-            actual,
-            expected="at least one network flow endpoint",
-            observed="none",
-            message=f"nothing reaches {actual.where}: it has no network flow endpoint",
-        )
-
-
 def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     report = actual.report
-    if actual.observed is None and report is None:
-        return
-    if report is not None and (report.error or report.nfes == ()):
-        return  # not made, or broken: that is said already
-    word, where = actual.kind.noun, actual.where
-    unique = uniqueness.is_unique(actual)
+    if (actual.observed is None and report is None) or (report is not None and report.error):
+        return  # not made: that is said already
+    unique, expected = uniqueness.is_unique(actual), "a unique network flow"
     if unique is None:
-        yield UNVERIFIABLE.on(
-            actual,
-            expected=f"unique {word}",
-            observed="network flow endpoints not reported",
-            message=f"{where} strictly requires a unique network flow, which"
-            f" is not proven: {_why_unproven(actual)}",
-        )
+        yield UNVERIFIABLE.on(actual, expected=expected, observed=_why_unproven(actual))
     elif unique is False:
-        shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes(actual))))
-        yield NOT_UNIQUE.on(
-            actual,
-            expected=f"unique {word}",
-            observed=f"shares {shared}",
-            message=f"{where} strictly requires a unique network flow and shares"
-            f" {shared} with other {word}s",
-        )
+        shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes(actual)))) or "none"
+        observed = f"has {shared} as other {actual.kind.noun}s have"
+        yield NOT_UNIQUE.on(actual, expected=expected, observed=observed)
 
 
 def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     if not flow.writer or not flow.reader or is_missing(flow):
         return  # the link is unmatched, and says so
-    how = flow.planned.unique.value
     publisher = uniqueness.is_unique(flow.writer)
     subscription = uniqueness.is_unique(flow.reader)
     met = meets(flow.planned.unique, publisher=publisher, subscription=subscription)
     if met:
         return
-    observed = f"publisher {_answer(publisher)}, subscription {_answer(subscription)}"
-    unproven = ", which is not proven" if met is None else ""
-    rule = UNVERIFIABLE if met is None else NOT_UNIQUE
-    yield rule.on(
+    article = "has" if met is False else "it has"
+    yield (UNVERIFIABLE if met is None else NOT_UNIQUE).on(
         flow,
-        expected=f"{how} unique flow",
-        observed=observed,
-        message=f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic} is not as"
-        f" its link demands, a {how} unique flow{unproven}; {observed}",
+        expected=f"{flow.planned.unique.value} unique network flow endpoints, as its link demands",
+        observed=f"{article} a publisher that is {_answer(publisher)}, a subscription that is"
+        f" {_answer(subscription)}",
     )
 
 
@@ -282,7 +236,7 @@ def _why_unproven(actual: Actual) -> str:
 
 
 def _answer(unique: bool | None) -> str:
-    return {True: "unique", False: "not unique", None: "unknown"}[unique]
+    return {True: "unique", False: "not unique", None: "perhaps unique"}[unique]
 
 
 def _spell(nfe: NetworkFlowEndpoint) -> str:
@@ -292,10 +246,15 @@ def _spell(nfe: NetworkFlowEndpoint) -> str:
     return known + nfe.describe()
 
 
+_CARRIED = "what carries {who} is {observed}, and must be {expected}"
+_NOT_SHOWN = "nothing shows that what carries {who} is {expected}: it is {observed}"
+
 WRONG_TRANSPORT = Rule(
     id="flow.wrong-transport",
     meaning="a flow that needs the network is carried by something else",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says=_CARRIED,
+    unproven=_NOT_SHOWN,
     fix="run both ends in our host and in processes of their own, or drop `transport: network`",
     concerns_flow=True,
 )
@@ -303,6 +262,8 @@ WRONG_MEDIUM = Rule(
     id="flow.wrong-medium",
     meaning="a flow is carried by something else than was negotiated",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says=_CARRIED,
+    unproven=_NOT_SHOWN,
     fix="compare the connections of both ends with `lifecycle plan`; see what each process was"
     " given by its environment",
     concerns_flow=True,
@@ -317,13 +278,15 @@ _WORDS = {
 
 
 def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
-    ends = flow.endpoints
     used = effective_transport(flow)
-    demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
-    if demanding and used not in NETWORK_MEDIA:
-        yield _not_by_network(flow, demanding[0], used)
-    elif flow.planned.medium not in ("", used) and _is_decided(view, flow):
-        yield _otherwise(flow, used)
+    network = [end for end in flow.endpoints if end.planned.transport is FlowTransport.NETWORK]
+    rule, expected, at = WRONG_MEDIUM, _WORDS.get(flow.planned.medium, flow.planned.medium), flow.at
+    if network and used not in NETWORK_MEDIA:
+        rule, expected, at = WRONG_TRANSPORT, "an IP transport", network[0].planned.at
+    elif flow.planned.medium in ("", used) or not _is_decided(view, flow):
+        return
+    outcome = Outcome.UNVERIFIABLE if used == UNKNOWN else Outcome.VIOLATED
+    yield rule.on(flow, outcome=outcome, expected=expected, observed=_WORDS[used], at=at)
 
 
 def _is_decided(view: View, flow: FlowView) -> bool:
@@ -338,40 +301,12 @@ def _is_decided(view: View, flow: FlowView) -> bool:
     )
 
 
-def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
-    unknown = used == UNKNOWN
-    why = "nothing shows what carries it" if unknown else f"what carries it is {_WORDS[used]}"
-    return WRONG_TRANSPORT.finding(
-        outcome=Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
-        subject=flow.subject,
-        ends=flow.ends,
-        expected="an IP transport",
-        observed=_WORDS[used],
-        message=f"the flow {flow.publisher} →"
-        f" {flow.subscription} on {flow.planned.topic} needs the network, and {why}",
-        at=demanding.planned.at,
-    )
-
-
-def _otherwise(flow: FlowView, used: str) -> Finding:
-    unknown = used == UNKNOWN
-    planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
-    word = _WORDS[used]
-    return WRONG_MEDIUM.on(
-        flow,
-        outcome=Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
-        expected=planned,
-        observed=word,
-        message=f"what carries {flow.publisher} →"
-        f" {flow.subscription} on {flow.planned.topic} must be {planned}, and"
-        f" {'nothing shows what it is' if unknown else f'is {word}'}",
-    )
-
-
 DSCP_NOT_APPLIED = Rule(
     id="flow.dscp-not-applied",
     meaning="the sockets that an endpoint sends from do not carry the declared DSCP",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="the sockets of {who} carry {observed}, and must carry {expected}",
+    unproven="the sockets of {who} carry {observed}; the manifest does not enforce {expected}",
     fix="see the node's log for the refused socket option; `enforce: false` makes it a warning",
     concerns_flow=True,
     may_block=False,
@@ -380,14 +315,14 @@ DSCP_UNVERIFIABLE = Rule(
     id="flow.dscp-unverifiable",
     meaning="nobody read back the DSCP of an endpoint that declares one",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="nothing shows that the sockets of {who} carry {expected}: {observed}",
     fix="only nodes in our host mark and read back; mark a foreign node's flow in the network",
     concerns_flow=True,
 )
 RULES = (
     *(MISSING_CONNECTION, FAILED_CONNECTION, OTHER_CONNECTION, WRONG_MAPPING),
-    *(NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT),
-    *(WRONG_TRANSPORT, WRONG_MEDIUM),
-    *(DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE),
+    *(NOT_UNIQUE, UNVERIFIABLE),
+    *(WRONG_TRANSPORT, WRONG_MEDIUM, DSCP_NOT_APPLIED, DSCP_UNVERIFIABLE),
 )
 
 
@@ -395,23 +330,17 @@ def _judge_dscp(actual: Actual) -> Iterator[Finding]:
     """Judge the DSCP of an endpoint; a subscription's is that of its acknowledgements."""
     planned, report = actual.planned, actual.report
     wanted, read = planned.dscp, report.dscp if report else None
-    if wanted is None:
+    if wanted is None or read == wanted:
         return
     if read is None:
         yield DSCP_UNVERIFIABLE.on(
-            actual,
-            expected=describe(wanted),
-            observed="not read back",
-            message=f"nothing shows the DSCP of {actual.where}: it was not read back",
+            actual, expected=describe(wanted), observed="it was not read back"
         )
-    elif read != wanted:
-        waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
-        yield DSCP_NOT_APPLIED.on(
-            actual,
-            outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
-            expected=describe(wanted),
-            observed=describe(read),
-            message=f"the sockets of {actual.where} carry {describe(read)}"
-            f" and not {describe(wanted)}{waived}",
-            hint="" if planned.enforce_dscp else "see the node's log for the refused option",
-        )
+        return
+    yield DSCP_NOT_APPLIED.on(
+        actual,
+        outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
+        expected=describe(wanted),
+        observed=describe(read),
+        hint="" if planned.enforce_dscp else "see the node's log for the refused option",
+    )

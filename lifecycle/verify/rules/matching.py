@@ -16,18 +16,17 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
 from lifecycle.manifest.qos import Certainty, incompatibilities
-from lifecycle.printable import listed
-from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.printable import count, listed
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Actual, FlowView, SeenEndpoint, View, brings_up
+from lifecycle.verify.view import FlowView, SeenEndpoint, TopicEnds, View, Whose, brings_up
 
 _rule = functools.partial(
     Rule,
@@ -35,7 +34,8 @@ _rule = functools.partial(
     about=About.MATCH,
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
-    absence="match",
+    says="{who} is not matched: {observed}",
+    unproven="nothing proves that {who} is matched: {observed}",
 )
 
 UNMATCHED_LINK = _rule(
@@ -53,6 +53,7 @@ UNMATCHED_FLOW = _rule(
 UNKNOWN_PEER = Rule(
     id="graph.unknown-peer",
     meaning="a declared endpoint is matched with more peers than the graph shows",
+    says="{who} is matched with {observed}, and may be with {expected}",
     fix="look for a participant that is found by the node's addresses alone (initial peers, a"
     " discovery server) and not by the supervisor; give the system a domain of its own",
     concerns_flow=True,
@@ -62,6 +63,7 @@ UNREPORTED_FLOW = Rule(
     id="flow.unreported",
     meaning="neither end of a flow reports anything, so that nothing proves that data can flow",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="nothing proves that data can flow, as neither end reports anything: {who}",
     fix="run one of its nodes in our host (`run: python`), or write it under `policy.trust`",
     heals=Heals.WITH_TIME,
 )
@@ -71,10 +73,7 @@ Match = tuple[Outcome, str]
 _OK: Match = (Outcome.OK, "")
 
 
-_Ends = tuple[list[SeenEndpoint], list[SeenEndpoint]]
-"""All publishers and all subscriptions of a topic, tools' and those that have ended included."""
-
-_NO_ENDS: _Ends = ([], [])
+_NO_ENDS: TopicEnds = ([], [])
 
 
 def obstacle(publisher: SeenEndpoint, subscription: SeenEndpoint) -> str:
@@ -122,18 +121,14 @@ def match(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow, every end that reports how many peers it has, every client."""
-    topics: dict[str, _Ends] = {}
-    for each in (*view.seen, *view.seen_of_tools, *view.departed):
-        publishers, subscriptions = topics.setdefault(each.name, ([], []))
-        (publishers if each.kind is EndpointKind.PUBLISHER else subscriptions).append(each)
     for flow in view.flows:
-        yield from _judge_flow(flow, topics.get(flow.planned.topic, _NO_ENDS))
-    yield from _unknown_peers(view, topics)
+        yield from _judge_flow(flow, view.topics.get(flow.planned.topic, _NO_ENDS))
+    yield from _unknown_peers(view)
     yield from _unreported_flows(view)
     yield from _clients(view)
 
 
-def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]:
+def _unknown_peers(view: View) -> Iterator[Finding]:
     """Find declared ends that are matched with more than all that can match them.
 
     That is what the graph shows, and what is declared and not seen (yet), which has a finding of
@@ -152,20 +147,18 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
             continue
         if not brings_up(actual.owner, view.machines):
             continue
-        publishers, subscriptions = topics.get(actual.name, _NO_ENDS)
+        publishers, subscriptions = view.topics.get(actual.name, _NO_ENDS)
         publishes = actual.kind is EndpointKind.PUBLISHER
         known = _possible(actual, subscriptions if publishes else publishers)
-        possible = sum(not each.has_ended for each in known)
+        possible = sum(each.whose is not Whose.DEPARTED for each in known)
         other = actual.kind.other_end
         place = (other, actual.name)
         if place in NOISE_TOPICS or report.matched <= len(known) + unseen[place]:
             continue
         yield UNKNOWN_PEER.on(
             actual,
-            expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
-            observed=f"matched {report.matched}",
-            message=f"{actual.where} is matched with more than the graph shows: it counts"
-            f" {report.matched}, and the graph shows {possible} that can match it",
+            expected=f"at most the {count(possible, other.noun)} that the graph shows",
+            observed=str(report.matched),
         )
 
 
@@ -177,11 +170,10 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
     names = [each.subject for each in flows]
     yield UNREPORTED_FLOW.finding(
         subject=names[0] if len(names) == 1 else f"{len(names)} flows",
+        who=listed(names, 6),
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
         observed="no report",
-        message=f"nothing proves that data can flow: neither end reports anything: "
-        f"{listed(names, 6)}",
         at=flows[0].at,
     )
 
@@ -193,7 +185,7 @@ def is_unreported(flow: FlowView) -> bool:
     return all(end.report is None or end.report.matched is None for end in flow.endpoints)
 
 
-def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
+def _judge_flow(flow: FlowView, ends: TopicEnds) -> Iterator[Finding]:
     linked = flow.planned.linked
     if cause := _cause(flow):
         outcome, reason = Outcome.VIOLATED, cause
@@ -206,17 +198,7 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     if outcome is Outcome.OK or (cause and not linked):
         return  # a cause has its own finding already
     rule = UNMATCHED_LINK if linked else UNMATCHED_FLOW
-    violated = outcome is Outcome.VIOLATED
-    pair = f"{flow.publisher} → {flow.subscription}"
-    yield rule.on(
-        flow,
-        outcome=outcome,
-        expected="matched",
-        observed=reason,
-        message=f"{pair} are not matched on {flow.planned.topic}: {reason}"
-        if violated
-        else f"nothing proves that {pair} are matched on {flow.planned.topic}: {reason}",
-    )
+    yield rule.on(flow, outcome=outcome, expected="matched", observed=reason)
 
 
 def _cause(flow: FlowView) -> str:
@@ -241,12 +223,13 @@ def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | No
     if report is None or report.matched is None:
         return None
     matched, known = report.matched, _possible(end, others)
-    possible = [each for each in known if not each.has_ended]
+    possible = [each for each in known if each.whose is not Whose.DEPARTED]
     word = f"the {end.kind.noun}"
     reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched none"
     if matched in (len(possible), len(known)):
         return _OK
-    if matched < len(possible) and (matched == 0 or not any(each.is_stranger for each in possible)):
+    knows_all = all(each.whose is Whose.DECLARED for each in possible)
+    if matched < len(possible) and (matched == 0 or knows_all):
         return Outcome.VIOLATED, reason
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
 
@@ -268,69 +251,40 @@ UNMATCHED_CLIENT = _rule(
 )
 RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW, UNMATCHED_CLIENT)
 
-_Place = tuple[EndpointKind, str, str]
-"""Kind, name and type."""
-
 SERVER_OF = {
     EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
     EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
-_SERVERS = frozenset(SERVER_OF.values())
 
 
 def _clients(view: View) -> Iterator[Finding]:
-    """Judge every declared client that reports and of which declared servers are there."""
-    servers: dict[_Place, list[str]] = {}
-    for actual in view.actual:
-        if actual.observed is not None and actual.observed.kind in _SERVERS:
-            servers.setdefault(_place(actual.observed), []).append(actual.node)
-    if not servers:
-        return
-    others = Counter(
-        map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
-    )
+    """Judge every declared client that reports and of which declared servers are there.
+
+    A client without a report has its own finding if it is ours; of others no more can be seen than
+    that both ends are there and of one type, as of their topics. Which server it is matched with is
+    not reported: one is enough.
+    """
+    servers: dict[tuple[EndpointKind, str, str], list[str]] = {}
+    for each in view.actual:
+        if each.observed is not None and each.kind in SERVER_OF.values():
+            servers.setdefault((each.kind, each.name, each.type), []).append(each.node)
     for client in view.actual:
-        kind = SERVER_OF.get(client.kind)
-        # A client without a report has its own finding if it is ours; of others no more can be seen
-        # than that both ends are there and of one type, as of their topics.
-        if kind is None or client.observed is None or client.report is None:
+        report, kind = client.report, SERVER_OF.get(client.kind)
+        if kind is None or client.observed is None or report is None:
             continue
-        place = kind, client.observed.name, client.observed.type
-        found = servers.get(place, ())
-        for server in dict.fromkeys(found):
-            yield from _judge_client(client, server, count=len(found) + others[place])
-
-
-def _place(seen: ObservedEndpoint) -> _Place:
-    return seen.kind, seen.name, seen.type
-
-
-def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Finding]:
-    report = client.report
-    assert report is not None
-    if not report.mapped:
-        return  # it is about to go, or discovery is ahead of the report
-    if report.server_matched is False:
-        outcome, reason = Outcome.VIOLATED, "the client counts no server as available"
-    elif report.server_matched is None:
-        outcome, reason = Outcome.UNVERIFIABLE, "its client does not report it"
-    elif count > 1:
-        outcome = Outcome.UNVERIFIABLE
-        reason = f"it has {count} servers, and the client does not report which it is matched with"
-    else:
-        return
-    name, node = client.name, client.node
-    says, state = "", "are not matched"
-    if outcome is not Outcome.VIOLATED:
-        says, state = "nothing proves that ", "are matched"
-    yield UNMATCHED_CLIENT.finding(
-        outcome=outcome,
-        subject=f"{name}: {node} → {server}",
-        ends=(node, server),
-        expected="matched",
-        observed=reason,
-        message=f"{says}{node} → {server} {state} on {client.kind.meets_in} {name}: {reason}",
-        at=client.planned.at,
-        node=node,
-        endpoint=client.kind,
-    )
+        found = servers.get((kind, client.name, client.type))
+        # One that is not mapped is about to go, or discovery is ahead of the report.
+        if not found or not report.mapped or report.server_matched:
+            continue
+        violated = report.server_matched is False
+        whom = listed(sorted({*found}), 2)
+        yield UNMATCHED_CLIENT.on(
+            client,
+            outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
+            subject=f"{client.name}: {client.node} → {whom}",
+            ends=(client.node, found[0]),
+            expected="matched",
+            observed="the client counts no server as available"
+            if violated
+            else "its client does not report it",
+        )

@@ -9,7 +9,6 @@ keep, and its packet error rate (TS 23.501 Table 5.7.4-1, clause 5.7.3.4).
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
@@ -35,7 +34,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.rules.flows import is_missing
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, brings_up
+from lifecycle.verify.view import Actual, FlowView, NodeFacts, View, Whose, brings_up
 
 PROBATION_S = 10.0
 """What can be decided at all in a system that was brought up is waited for this long."""
@@ -67,28 +66,33 @@ SILENT = _rule(
     meaning="nothing has arrived for longer than the manifest allows",
     fix="see whether the publisher publishes; its node is active and matched",
 )
+_UNMEASURED = "{expected} of {who} is not measured: {observed}"
 NOT_MEASURED = Rule(
     id="flow.not-measured",
     meaning="a number that the manifest declares of a flow has not been measured",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven=_UNMEASURED,
     fix="have the subscribing node run in our host (`run: python`), write `measure: true`, or leave"
     " the number out; `--strict` refuses it, and so does `policy.unverifiable: block`",
     heals=Heals.NEVER,
-    names_expected=True,
+    numbers=True,
 )
 NOTHING_ARRIVED = Rule(
     id="flow.nothing-arrived",
     meaning="a number cannot be measured, because nothing has arrived since activation",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven=_UNMEASURED,
     fix="see whether the publisher publishes; declare `max_silence_s` where it must",
     heals=Heals.WITH_TIME,
-    names_expected=True,
+    numbers=True,
     measured=True,
 )
 DSCP_LOST = Rule(
     id="flow.dscp-lost",
     meaning="the DSCP of a flow does not arrive at the other host",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="what is sent as {expected} beside {who} arrives as {observed}",
+    unproven="what is sent as {expected} beside {who} does not arrive",
     fix="have what is between the hosts keep the DSCP (RFC 2474): a router or switch that does not"
     " trust it, a tunnel or a radio link that does not copy it; or have it set it again",
     heals=Heals.WITH_TIME,
@@ -178,29 +182,11 @@ class _Counted(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         periods = (1 / each.least for each in bounds if each.kind is Kind.RATE and each.least)
         return max([PROBATION_S, *silences, *periods])
 
-    @property
-    def where(self) -> str:
-        """How messages name it."""
-        flow = self.flow
-        return f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-
-    def finding(self, rule: Rule, quantity: Quantity, observed: str, message: str) -> Finding:
+    def finding(self, rule: Rule, quantity: Quantity, observed: str, message: str = "") -> Finding:
         """Return a finding on one of its numbers."""
-        return rule.finding(
-            subject=self.flow.subject,
-            expected=str(quantity),
-            observed=observed,
-            message=message,
-            at=quantity.at,
-            ends=self.flow.ends,
+        return rule.on(
+            self.flow, expected=str(quantity), observed=observed, message=message, at=quantity.at
         )
-
-    def not_measured(
-        self, quantity: Quantity, why: str, *, rule: Rule = NOT_MEASURED, observed: str = ""
-    ) -> Finding:
-        """Return the finding that one of its numbers is not measured, and why."""
-        message = f"{quantity} of {self.where} is not measured: {why}"
-        return self.finding(rule, quantity, observed or "not measured", message)
 
     def why_not(self, quantity: Quantity) -> str:
         """Return why a number of it cannot be measured; empty if it can."""
@@ -260,7 +246,7 @@ def check(view: View) -> Iterator[Finding]:
     for each in counted:
         for quantity in each.flow.planned.quantities:
             if why := each.why_not(quantity):
-                yield each.not_measured(quantity, why)
+                yield each.finding(NOT_MEASURED, quantity, why)
         if _is_active(view, each.flow):
             yield from _judged(view, each)
     yield from _marks(view)
@@ -278,16 +264,11 @@ def _marks(view: View) -> Iterator[Finding]:
         arrives_as = view.marks.get((publisher.machine, dscp), dscp)
         if arrives_as == dscp:
             continue  # or it is too early
-        known = arrives_as is not None
-        observed = "nothing" if arrives_as is None else describe(arrives_as)
-        what = f"what {publisher.machine} sends as {describe(dscp)} beside the flow"
         yield DSCP_LOST.on(
             flow,
-            outcome=Outcome.VIOLATED if known else Outcome.UNVERIFIABLE,
+            outcome=Outcome.UNVERIFIABLE if arrives_as is None else Outcome.VIOLATED,
             expected=describe(dscp),
-            observed=observed,
-            message=f"{what} {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-            + (f" arrives as {observed}" if known else " does not arrive"),
+            observed="nothing" if arrives_as is None else describe(arrives_as),
         )
 
 
@@ -366,14 +347,14 @@ def _judged(view: View, each: _Counted) -> Iterator[Finding]:
         sample = each.sample
         assert sample is not None
         if judgement.kept is False:
-            message = f"{each.where}: {judgement.observed} {judgement.allowed}"
+            message = f"{each.flow.where}: {judgement.observed} {judgement.allowed}"
             yield each.finding(_RULES[bound.kind], quantity, judgement.observed, message)
         elif _is_given_up(judgement) and view.clocks is not None:
             why = _too_uncertain(quantity, bound, judgement, each)
-            yield each.not_measured(quantity, why, observed=judgement.observed)
+            yield each.finding(NOT_MEASURED, quantity, why)
         elif judgement.kept is None and not sample.messages and sample.seconds > each.awaited_s:
             why = f"nothing has arrived for {sample.silent_s:.0f} s"
-            yield each.not_measured(quantity, why, rule=NOTHING_ARRIVED, observed="no message")
+            yield each.finding(NOTHING_ARRIVED, quantity, why)
 
 
 def _unmeasured_at(
@@ -391,15 +372,7 @@ def _unmeasured_at(
         verb = "subscribes to" if actual.kind is EndpointKind.PUBLISHER else "publishes"
         why = f"nothing that is there and declared {verb} it"
     if why and not (anywhere and "" in reasons):
-        yield NOT_MEASURED.finding(
-            subject=actual.name,
-            expected=str(quantity),
-            observed="not measured",
-            message=f"{quantity} of {actual.where} is not measured: {why}",
-            at=quantity.at,
-            node=actual.node,
-            endpoint=actual.kind,
-        )
+        yield NOT_MEASURED.on(actual, expected=str(quantity), observed=why, at=quantity.at)
 
 
 def _counted(view: View) -> list[_Counted]:
@@ -407,11 +380,11 @@ def _counted(view: View) -> list[_Counted]:
     for flow in view.flows:
         arriving.setdefault((flow.planned.topic, flow.subscription), []).append(flow)
     found = []
-    seen = (*view.seen, *view.seen_of_tools)
-    publishers = Counter(each.name for each in seen if each.kind is EndpointKind.PUBLISHER)
     for (topic, _), flows in arriving.items():
         reader = flows[0].reader
         numbers = reader.planned.quantities if reader else ()
+        seen, _ = view.topics.get(topic, ((), ()))
+        publishers = sum(each.whose is not Whose.DEPARTED for each in seen)
         sample = _sample(view, flows[0])
         there = [each for each in flows if not is_missing(each)]
         active = [each for each in there if _is_active(view, each)]
@@ -423,7 +396,7 @@ def _counted(view: View) -> list[_Counted]:
             counted = _Counted(
                 flow=flow,
                 sample=sample,
-                several=max(len(flows), publishers[topic]),
+                several=max(len(flows), publishers),
                 publish_s=() if None in times else publish_s,
                 has_clocks=_has_clocks(view, flow),
                 clock=_clock(view, flows, sample),
@@ -472,8 +445,8 @@ def _clock(view: View, flows: Sequence[FlowView], sample: Sample | None) -> Cloc
     if not far:
         return SAME_CLOCK
     clocks = view.clocks or {}
-    # Where no shift is, it was counted as of this host's clock: the plan was another then.
-    if sample is None or sample.used.shift_ns is None or not far <= clocks.keys():
+    # It may have been counted as of this host's clock: the plan was another then.
+    if sample is None or not sample.used.apart or not far <= clocks.keys():
         return None
     near = [] if all(map(_differ, flows)) else [SAME_CLOCK]
     return ClockOffset.any_of((*near, *(clocks[each] for each in far)))

@@ -10,34 +10,37 @@ from lifecycle.plan.model import PlannedProcess
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import View, brings_up, is_beyond
+from lifecycle.verify.view import View, Whose, brings_up, is_beyond
 
 MISSING_NODE = Rule(
     id="graph.missing-node",
     meaning="a declared node is not in the graph",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
     fix="look at the node's process and its log; compare domain, RMW and discovery range",
+    says="there is no {who} {expected}",
     concerns_flow=True,
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
     if_undiscovered=True,
-    absence="node",
 )
 UNDECLARED_NODE = Rule(
     id="graph.undeclared-node",
     meaning="the graph has a node that the manifest does not declare",
+    says="the manifest does not declare {who}",
     fix="declare it, stop it, give the system a domain of its own, or set"
     " policy.undeclared_nodes: open",
 )
 DUPLICATE_NODE = Rule(
     id="graph.duplicate-node",
     meaning="several nodes carry one fully qualified name",
+    says="there are {observed} named {who}",
     fix="stop the other one, or give each its own name or namespace",
 )
 ENDED_NODE = Rule(
     id="graph.ended-node",
     meaning="a node that may end by itself has ended",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="{who} may end by itself, and is not there: {observed}",
     fix="nothing, if its work was to be done once; without `may_end` its end is a failure",
     concerns_flow=True,
     heals=Heals.NEVER,
@@ -59,14 +62,8 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
         if name in view.observed:
             continue
         if name in view.over:
-            yield ENDED_NODE.on(
-                node,
-                expected="node in the graph, or ended by itself",
-                observed=view.over[name] or "no such node",
-                message=f"node {name} has ended by itself, as it may"
-                if view.over[name]
-                else f"node {name} may have ended by itself, or not have started",
-            )
+            how = view.over[name] or "it has ended, or not started"
+            yield ENDED_NODE.on(node, expected="there, or ended by itself", observed=how)
             continue
         hint = ""
         if node.run.component:
@@ -83,15 +80,12 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
         beyond = is_beyond(node, view.machines)
         if beyond:
             hint = f"the supervisor of machine {node.machine!r} verifies it"
+        far = f"it uses the shared memory of machine {node.machine!r} alone"
         yield MISSING_NODE.on(
             node,
             outcome=Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
-            expected="node in the graph",
-            observed="out of reach" if beyond else "no such node",
-            message=f"node {name} cannot be seen from here: it uses the shared memory of machine"
-            f" {node.machine!r} alone"
-            if beyond
-            else f"there is no node {name} in domain {view.plan.domain_id}",
+            expected=f"in domain {view.plan.domain_id}",
+            observed=far if beyond else "not there",
             hint=hint,
         )
 
@@ -145,9 +139,8 @@ def _duplicate(view: View) -> Iterator[Finding]:
             hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
         yield DUPLICATE_NODE.finding(
             subject=name,
-            expected="1 node of this name",
+            expected="1 node",
             observed=f"{count} nodes",
-            message=f"there are {count} nodes named {name}",
             at=node.at if node else None,
             node=name,
             hint=hint,
@@ -156,7 +149,7 @@ def _duplicate(view: View) -> Iterator[Finding]:
 
 def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     owned: dict[str, list[str]] = {}
-    for endpoint in view.foreign:
+    for endpoint in view.of(Whose.FOREIGN):
         owned.setdefault(endpoint.node, []).append(f"{endpoint.kind.noun} of {endpoint.name}")
     undeclared = {name for name in view.observed if name not in view.planned} | set(owned)
     for name in sorted(undeclared):
@@ -164,9 +157,9 @@ def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding
         missing = [each for each, names in others.items() if name in names]
         yield UNDECLARED_NODE.finding(
             subject=name,
+            who=f"node {name}",
             expected="no such node",
             observed=f"node with {endpoints}" if endpoints else "node",
-            message=f"the manifest does not declare node {name}",
             node=name,
             hint=f"if it is {' or '.join(missing)}, which is missing, write a `name` there; else"
             f" {UNDECLARED_NODE.fix}"

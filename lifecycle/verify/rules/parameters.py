@@ -5,7 +5,7 @@ Of what `lifecycle check` warns only that is repeated here which no observation 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -14,16 +14,17 @@ from lifecycle.manifest.parameter_values import NOT_FINITE, is_implicit
 from lifecycle.plan.model import ExpectedParameter, PlannedNode, uses_sim_time
 from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN
 from lifecycle.printable import listed
-from lifecycle.verify.observation import SERVES_NONE, ObservedEndpoint, ParameterReport
+from lifecycle.verify.observation import SERVES_NONE, ParameterReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
 from lifecycle.verify.tool_filter import CLOCK
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import NodeFacts, View
+from lifecycle.verify.view import NodeFacts, SeenEndpoint, View, Whose
 
 MISSING = Rule(
     id="param.missing",
     meaning="a node does not have a parameter that is declared or given",
+    says="{who} must be {expected}, and there is {observed}",
     fix="correct the name, or have the node declare it",
     heals=Heals.WITH_TIME,
 )
@@ -45,18 +46,21 @@ READ_ONLY_DIFFERS = Rule(
 UNDECLARED = Rule(
     id="param.undeclared",
     meaning="a declared node has parameters that its interface does not declare",
+    says="the interface of {who} does not declare {observed}",
     fix="declare them in the node's interface, remove them, or set `endpoints: open` on the node",
 )
 UNVERIFIABLE = Rule(
     id="param.unverifiable",
     meaning="parameters of a node could not be read, or not what they must be",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="nothing shows {expected} of {who}: {observed}",
     fix="see whether `ros2 param list` shows the node's parameters; look at its log",
 )
 REACHED_NONE = Rule(
     id="param.reached-none",
     meaning="a value that is given for nodes by a name or a pattern is a parameter of none",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="no node has parameter {who}, {expected}",
     fix="correct the name of the node or of the parameter, or remove the value",
     heals=Heals.WITH_TIME,
 )
@@ -112,10 +116,8 @@ def _reached_none(view: View) -> Iterator[Finding]:
     for at, (each, nodes) in found.items():
         yield REACHED_NONE.finding(
             subject=each.name,
-            expected=_wanted(each),
+            expected=f"{_wanted(each)} for {', '.join(nodes[:_NAMED])}",
             observed="no such parameter",
-            message=f"no node has parameter {each.name}, which is {_origin(each)} "
-            f"for {', '.join(nodes[:_NAMED])}",
             at=at,
         )
 
@@ -135,47 +137,31 @@ def _known(facts: NodeFacts) -> dict[str, ParameterReport] | str:
 def _judge(
     node: PlannedNode, expected: ExpectedParameter, actual: ParameterReport | None
 ) -> Iterator[Finding]:
-    what = f"parameter {expected.name} of node {node.full_name}"
     place: dict[str, Any] = {
         "subject": f"{node.full_name}: {expected.name}",
+        "who": f"parameter {expected.name} of node {node.full_name}",
         "at": expected.at,
         "node": node.full_name,
     }
+    wanted = _wanted(expected)
     if actual is None:
         if not expected.optional:
-            yield MISSING.finding(
-                **place,
-                expected=_wanted(expected),
-                observed="no such parameter",
-                message=f"there is no {what}, which is {_origin(expected)}",
-            )
+            yield MISSING.finding(**place, expected=wanted, observed="no such parameter")
         return
     if not _is_of_type(actual, expected.type):
-        yield TYPE_DIFFERS.finding(
-            **place,
-            expected=expected.type,
-            observed=actual.type or "not set",
-            message=f"{what} is {_with_type(actual)}, and must be "
-            f"{expected.type} as {_origin(expected)}",
-        )
+        yield TYPE_DIFFERS.finding(**place, expected=wanted, observed=_with_type(actual))
     elif expected.value is not None and not actual.has(expected.value):
-        wanted = spell(expected.value, expected.type)
-        hint = ""
-        if expected.source == DEFAULT:
-            hint = "give the value that is meant under `parameters`, or correct the default"
         yield VALUE_DIFFERS.finding(
             **place,
             expected=wanted,
             observed=_value_of(actual),
-            message=f"{what} is {_value_of(actual)}, and must be {wanted} as {_origin(expected)}",
-            hint=hint,
+            hint="give the value that is meant under `parameters`, or correct the default"
+            if expected.source == DEFAULT
+            else "",
         )
     if expected.read_only and not actual.read_only:
         yield READ_ONLY_DIFFERS.finding(
-            **place,
-            expected="read_only",
-            observed="can be set",
-            message=f"{what} can be set, and must be read_only as its interface declares it",
+            **place, expected="read_only, as its interface declares it", observed="not read_only"
         )
 
 
@@ -191,43 +177,31 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
         yield UNDECLARED.on(
             node,
             expected="no such parameter",
-            observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
-            message=f"the interface of node {node.full_name} does not declare {_listed(names)}",
+            observed=listed([f"{name} ({known[name].type})" for name in names], _NAMED),
         )
 
 
 def _unknown(node: PlannedNode, why: str) -> Finding:
     names = [each.name for each in node.expected_parameters]
-    what = _listed(names) if names else "that there are no parameters"
     return UNVERIFIABLE.on(
         node,
-        expected=", ".join(names) or "no parameters",
-        observed="unknown",
-        message=f"nothing shows {what} of node {node.full_name}: {why}",
+        expected=f"parameters {listed(names, _NAMED)}" if names else "that there are no parameters",
+        observed=why,
     )
 
 
 def _unread(node: PlannedNode, file: str) -> Finding:
-    return UNVERIFIABLE.finding(
+    return UNVERIFIABLE.on(
+        node,
         subject=f"{node.full_name}: {file}",
-        expected=f"values of {file}",
-        observed="unknown",
-        message=f"nothing shows the parameters that {file} gives node {node.full_name}: "
-        "it could not be read",
-        at=node.at,
-        node=node.full_name,
+        expected=f"the parameters that {file} gives",
+        observed="it could not be read",
         hint="lifecycle check says what keeps it from being read",
     )
 
 
-def _listed(names: Sequence[str]) -> str:
-    if len(names) == 1:
-        return f"parameter {names[0]}"
-    return f"parameters {listed(names, _NAMED)}"
-
-
 def _origin(expected: ExpectedParameter) -> str:
-    """Return where the demand comes from, to follow "is" or "as"."""
+    """Return where the demand comes from."""
     if not expected.source:
         return "declared in its interface"
     if expected.source == DEFAULT:
@@ -240,9 +214,9 @@ def _origin(expected: ExpectedParameter) -> str:
 
 
 def _wanted(expected: ExpectedParameter) -> str:
-    if expected.value is None:
-        return expected.type
-    return f"{expected.type} {spell(expected.value, expected.type)}"
+    """Return what is demanded, and by whom."""
+    value = "" if expected.value is None else f" {spell(expected.value, expected.type)}"
+    return f"{expected.type}{value} as {_origin(expected)}"
 
 
 def _is_of_type(actual: ParameterReport, type_: str) -> bool:
@@ -327,25 +301,28 @@ def _of_warning(warning: Diagnostic) -> Finding:
 NO_CLOCK = Rule(
     id="time.no-clock",
     meaning="nodes use simulated time, and nobody publishes /clock",
+    says="there is no time for {who}: {observed}",
     fix="start the simulator or the bag (`ros2 bag play --clock`), or set use_sim_time: false",
     heals=Heals.WITH_TIME,
-    absence="publisher of simulated time",
 )
 SEVERAL_CLOCKS = Rule(
     id="time.several-clocks",
     meaning="nodes use simulated time, and /clock has more than one publisher",
+    says="{who} must have {expected} of their time, and have {observed}",
     fix="stop all but one: each makes time jump to its own",
 )
 UNDECLARED_CLOCK = Rule(
     id="time.undeclared-clock",
     meaning="nodes use simulated time, and who publishes /clock is not declared to",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="{who} have their time from {observed}, which is no {expected}",
     fix="declare the publisher of /clock, rosgraph_msgs/msg/Clock, in the node that has it",
 )
 SILENT_CLOCK = Rule(
     id="time.silent-clock",
     meaning="nodes use simulated time, and the publisher of /clock has not sent any yet",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="there is no time yet for {who}: {observed}",
     fix="see whether the simulator runs, or is paused before its first step",
     heals=Heals.WITH_TIME,
 )
@@ -363,19 +340,18 @@ def _time(view: View) -> Iterator[Finding]:
     if not users:
         return
     topic, type_ = CLOCK
+    ends, _ = view.topics.get(topic, ((), ()))
     publishers = [
         each
-        for group in view.groups.values()
-        for each in group
-        if (each.kind, each.name, each.type) == (EndpointKind.PUBLISHER, topic, type_)
+        for each in ends
+        if each.type == type_ and each.is_shown and each.whose is not Whose.DEPARTED
     ]
     if len(publishers) > 1:
         owners = ", ".join(sorted(each.node or "an unknown node" for each in publishers))
         yield SEVERAL_CLOCKS.finding(
             **_place(users),
             expected="one publisher",
-            observed=f"{len(publishers)} publishers",
-            message=f"several nodes give {_named(users)} their time: {owners} publish {topic}",
+            observed=f"{len(publishers)} publishers of {topic}: {owners}",
         )
     elif not publishers:
         # Of a declared one that is missing, or cannot be seen from here, there is a finding.
@@ -383,32 +359,27 @@ def _time(view: View) -> Iterator[Finding]:
             yield NO_CLOCK.finding(
                 **_place(users),
                 expected=f"publisher of {type_}",
-                observed="no publisher",
-                message=f"there is no simulated time for {_named(users)}:"
-                f" nothing publishes {topic}",
+                observed=f"nothing publishes {topic}",
             )
     else:
         yield from _of_one(view, users, publishers[0])
 
 
-def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -> Iterator[Finding]:
+def _of_one(view: View, users: list[PlannedNode], publisher: SeenEndpoint) -> Iterator[Finding]:
     who = publisher.node or "an unknown node"
-    if (publisher.node, publisher.kind, publisher.name) not in view.names.ends:
+    if publisher.planned is None:
         yield UNDECLARED_CLOCK.finding(
             **_place(users),
             expected="declared publisher",
-            observed=f"publisher of {who}",
-            message=f"{who} gives {_named(users)} their time on {publisher.name},"
-            " and the manifest does not declare it",
+            observed=f"the publisher of {publisher.name} in {who}",
         )
     # A managed publisher sends once it is active.
-    if publisher.silent and view.stage is Stage.ACTIVE:
+    seen = publisher.observed
+    if seen is not None and seen.silent and view.stage is Stage.ACTIVE:
         yield SILENT_CLOCK.finding(
             **_place(users),
             expected="time",
-            observed="no message",
-            message=f"there is no time yet for {_named(users)}:"
-            f" {who} has not sent any on {publisher.name}",
+            observed=f"{who} has not sent any on {publisher.name}",
         )
 
 
@@ -427,14 +398,11 @@ def _publishes(node: PlannedNode) -> bool:
     )
 
 
-def _named(users: list[PlannedNode]) -> str:
-    return listed([each.full_name for each in users], 4)
-
-
 def _place(users: list[PlannedNode]) -> dict[str, Any]:
     """Return what findings are about, and where the first of the nodes is given its time."""
     given = next(
         (each.at for node in users for each in node.expected_parameters if each.name == SIM_TIME),
         users[0].at,
     )
-    return {"subject": CLOCK[0], "at": given, "endpoint": EndpointKind.PUBLISHER}
+    who = listed([each.full_name for each in users], 4)
+    return {"subject": CLOCK[0], "who": who, "at": given, "endpoint": EndpointKind.PUBLISHER}

@@ -26,6 +26,7 @@ from lifecycle.verify.view import Actual, NodeFacts, SeenEndpoint, View
 QOS_DIFFERS = Rule(
     id="graph.qos-differs",
     meaning="an endpoint's QoS is not the declared one",
+    says="{who} has {observed}, and must have {expected}",
     fix="correct the profile in the manifest or in the node; look for an XML profile or a"
     " qos_overrides parameter",
 )
@@ -33,6 +34,7 @@ QOS_UNVERIFIABLE = Rule(
     id="graph.qos-unverifiable",
     meaning="declared QoS policies can be read neither from discovery nor from the node",
     outcomes=(Outcome.UNVERIFIABLE,),
+    unproven="nothing shows the QoS of {who} on {expected}: {observed}",
     fix="Fast DDS does not announce history and depth, only nodes in our host report them: leave"
     " both out, write the other policies instead of a preset, or `trust` this rule",
 )
@@ -40,6 +42,8 @@ QOS_INCOMPATIBLE = Rule(
     id="graph.qos-incompatible",
     meaning="a publisher offers less than a subscription of its topic requests",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="{who} do not match: {observed} is offered, {expected} is requested",
+    unproven="{who} may not match: {observed} is offered, {expected} is requested",
     fix="offer more or request less: DDS does not match them, and no data flows",
     concerns_flow=True,
 )
@@ -56,11 +60,8 @@ def check(view: View) -> Iterator[Finding]:
     """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
     for facts in view.nodes.values():
         yield from _of_node(facts)
-    topics: dict[str, list[SeenEndpoint]] = {}
-    for each in view.seen:
-        topics.setdefault(each.name, []).append(each)
-    for name in sorted(topics):
-        yield from _pairs(view, topics[name])
+    for name in sorted(view.topics):
+        yield from _pairs(view, *view.topics[name])
 
 
 def _of_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -88,32 +89,22 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
         elif have != want:
             differing.append((policy, want, have))
     for policy, want, have in differing:
-        yield QOS_DIFFERS.on(
-            actual,
-            expected=f"{policy} {want}",
-            observed=f"{policy} {have}",
-            message=f"{actual.where} has {policy} {have}, and is declared with {want}",
-        )
+        yield QOS_DIFFERS.on(actual, expected=f"{policy} {want}", observed=f"{policy} {have}")
     if hidden:
         unknown.append((actual, hidden))
 
 
 def _unverifiable(node: PlannedNode, unknown: _Unknown) -> Finding:
     """One finding for a node: what is not announced is the same for all of its endpoints."""
-    policies = ", ".join(dict.fromkeys(policy for _, hidden in unknown for policy, _ in hidden))
-    listed = ", ".join(_spell_end(each) for each, _ in unknown)
-    of = listed if len(unknown) == 1 else f"{len(unknown)} endpoints: {listed}"
-    return QOS_UNVERIFIABLE.finding(
-        subject=node.full_name,
-        expected="; ".join(
-            f"{_spell_end(each)}: " + ", ".join(f"{policy} {want}" for policy, want in hidden)
-            for each, hidden in unknown
-        ),
-        observed="not announced",
-        message=f"nothing shows {policies} of {node.full_name} on {of}: neither discovery nor the"
-        " node reports the actual value",
+    wanted = [
+        f"{_spell_end(each)}: " + ", ".join(f"{policy} {want}" for policy, want in hidden)
+        for each, hidden in unknown
+    ]
+    return QOS_UNVERIFIABLE.on(
+        node,
+        expected="; ".join(wanted),
+        observed="neither discovery nor the node reports the actual value",
         at=unknown[0][0].planned.at,
-        node=node.full_name,
     )
 
 
@@ -165,16 +156,18 @@ def spell(profile: QosProfile, policy: str) -> str:
     return "infinite" if value in (None, 0, INFINITE_NS) else f"{value} ns"
 
 
-def _pairs(view: View, ends: list[SeenEndpoint]) -> Iterator[Finding]:
+def _pairs(
+    view: View, publishers: list[SeenEndpoint], subscriptions: list[SeenEndpoint]
+) -> Iterator[Finding]:
     """Every publisher against every subscription of a topic, at least one of them ours.
 
     Of an end that nobody observed there is no QoS to compare: its node is named as out of reach,
     and its flows are proven by those that count whom they are matched with.
     """
-    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER and each.is_shown]
-    subscriptions = [
-        each for each in ends if each.kind is not EndpointKind.PUBLISHER and each.is_shown
-    ]
+    publishers, subscriptions = (
+        [each for each in ends if each.is_shown and not each.is_passing]
+        for ends in (publishers, subscriptions)
+    )
     done: set[tuple[str, str, str, str, str]] = set()
     for publisher in publishers:
         for subscription in subscriptions:
@@ -202,14 +195,12 @@ def _incompatible(
     certain = found.severity is Certainty.CERTAIN
     offers, requests = publisher.node or "an unknown node", subscription.node or "an unknown node"
     declared = publisher.planned or subscription.planned
-    how = "do not match" if certain else "may not match"
     return QOS_INCOMPATIBLE.finding(
         outcome=Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
         subject=f"{publisher.name}: {offers} → {requests}",
+        who=f"{offers} → {requests} on {publisher.name}",
         ends=tuple(filter(None, (publisher.node, subscription.node))),
-        expected=f"{found.policy} of at least {found.requested} offered",
-        observed=f"{found.policy} {found.offered} offered",
-        message=f"{offers} → {requests} {how} on {publisher.name}: {offers} offers"
-        f" {found.policy} {found.offered}, {requests} requests {found.policy} {found.requested}",
+        expected=f"{found.policy} {found.requested}",
+        observed=f"{found.policy} {found.offered}",
         at=declared.at if declared else None,
     )

@@ -19,14 +19,10 @@ _rule = functools.partial(Rule, about=About.PROGRESS, heals=Heals.WITH_TIME, if_
 
 WRONG_STATE = _rule(
     id="state.wrong-state",
-    meaning="a managed node is not in the state that this stage needs",
-    fix="look at the node's log for the transition that failed, or at who else drives it",
-)
-STATE_UNVERIFIABLE = _rule(
-    id="state.unverifiable",
-    meaning="a managed node's state could not be learnt",
-    outcomes=(Outcome.UNVERIFIABLE,),
-    fix="see whether its ~/get_state answers; a plain node must be declared `managed: false`",
+    meaning="a managed node is not in the state that this stage needs, or shows none",
+    outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    fix="look at the node's log for the transition that failed, or at who else drives it; a plain"
+    " node must be declared `managed: false`",
 )
 ACTIVATED_AT_CLOSED_GATE = _rule(
     id="state.activated-at-closed-gate",
@@ -51,7 +47,16 @@ def check(view: View) -> Iterator[Finding]:
         yield from _judge_health(view, facts)
         yield from _faults(facts)
     for facts in view.nodes.values():
-        yield from _judge_report(facts)
+        if not facts.is_ours or facts.absent:
+            continue
+        if facts.configuration is None:
+            yield MISSING_REPORT.on(facts.node, expected="configuration", observed="no report")
+            continue
+        for actual in facts.actual:
+            if actual.report is None:
+                yield INCOMPLETE_REPORT.on(
+                    actual, expected="in its node's report", observed="not mentioned"
+                )
 
 
 def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
@@ -82,26 +87,22 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             wrong = ["inactive, disconnected"]
     expected = " or ".join([expected, *sorted(allowed - {wanted})])
     if wrong:
-        yield WRONG_STATE.on(
-            node,
-            expected=expected,
-            observed=wrong[0],
-            message=f"node {name} is {wrong[0]} and must be {expected}",
-        )
+        yield WRONG_STATE.on(node, outcome=Outcome.VIOLATED, expected=expected, observed=wrong[0])
     elif observed is not None and observed.managed is False and not _reports_state(facts):
         yield WRONG_STATE.on(
             node,
-            expected=f"managed node, {expected}",
-            observed="not a managed node",
-            message=f"node {name} offers no lifecycle services",
+            outcome=Outcome.VIOLATED,
+            expected=expected,
+            observed="no managed node: it offers no lifecycle services",
             hint="make it a managed node, or declare it `managed: false`",
         )
     elif not states:
-        yield STATE_UNVERIFIABLE.on(
+        yield WRONG_STATE.on(
             node,
+            outcome=Outcome.UNVERIFIABLE,
             expected=expected,
-            observed="unknown",
-            message=f"nothing shows the state of node {name}: neither a report nor a service",
+            observed="neither a report nor a service shows its state",
+            hint="see whether its ~/get_state answers",
         )
 
 
@@ -118,61 +119,25 @@ def _reports_state(facts: NodeFacts) -> bool:
 MISSING_REPORT = _rule(
     id="config.missing-report",
     meaning="a node of ours did not report its configuration",
+    says="{who} did not report its {expected}",
     fix="see whether its ~/get_configuration answers; look at its log",
-    absence="report",
 )
 INCOMPLETE_REPORT = _rule(
     id="config.incomplete-report",
     meaning="a node of ours does not mention a declared endpoint in its report",
     fix="the node runs from another manifest, or has not connected: compare and restart it",
-    absence="{kind} in the report of {node}",
 )
-
-
-def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
-    name = facts.name
-    if not facts.is_ours or facts.absent:
-        return
-    if facts.configuration is None:
-        yield MISSING_REPORT.on(
-            facts.node,
-            expected="node configuration",
-            observed="no report",
-            message=f"node {name} did not report its configuration",
-        )
-        return
-    for actual in facts.actual:
-        if actual.report is not None:
-            continue
-        word = actual.kind.noun
-        yield INCOMPLETE_REPORT.on(
-            actual,
-            expected=f"{word} in the report of {name}",
-            observed="not mentioned",
-            message=f"{name} does not report the {word} of {actual.name}",
-        )
-
-
 UNHEALTHY = Rule(
     id="node.unhealthy",
     meaning="a node says that it is not healthy, or does not say how it is",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
+    says="{who} is not {expected}: {observed}",
     fix="the message says what is wrong; look at the node's log",
     about=About.PROGRESS,
     heals=Heals.WITH_TIME,
 )
-NOT_ASKED = Rule(
-    id="node.without-health",
-    meaning="a node is to be asked whether it is healthy, and its class has no `health` method",
-    fix="give its class a method 'health', or write 'health: {diagnostics: NAME}'",
-)
-RULES = (
-    *(WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE),
-    *(UNHEALTHY, NOT_ASKED),
-    *(MISSING_REPORT, INCOMPLETE_REPORT),
-)
+RULES = (WRONG_STATE, ACTIVATED_AT_CLOSED_GATE, UNHEALTHY, MISSING_REPORT, INCOMPLETE_REPORT)
 
-_HEALTHY = "healthy"
 _NO_METHOD = HealthReport(
     ok=None, message="it reports no health; its class needs a method 'health'"
 )
@@ -204,22 +169,16 @@ def _judge_health(view: View, facts: NodeFacts) -> Iterator[Finding]:
     if node.health is None or facts.absent:
         return
     # One that has the method reports what it returned, or that it has not returned, at once.
-    lacks = report is not None and report.connected and report.health is None
-    if node.health.check and lacks:
-        yield NOT_ASKED.on(
-            node,
-            expected="a method 'health'",
-            observed="none",
-            message=f"node {node.full_name} is to be asked whether it is healthy, and "
-            "its class has no method 'health'",
-        )
+    if node.health.check and report is not None and report.connected and report.health is None:
+        yield _unhealthy(node, replace(_NO_METHOD, ok=False))
+        return
     # A method is asked from when its node is connected, and a held node publishes nothing before it
     # is active; until then its state, or the lack of a report, says enough.
     asks = not facts.is_ours or (report is not None and report.connected)
     works = not node.holds or view.stage is Stage.ACTIVE or facts.name in view.ahead
     asked = replace(
         node.health,
-        check=node.health.check and asks and not lacks,
+        check=node.health.check and asks,
         diagnostics=node.health.diagnostics if works else (),
     )
     health = health_of(
@@ -227,34 +186,19 @@ def _judge_health(view: View, facts: NodeFacts) -> Iterator[Finding]:
         None if report is None else report.health,
         None if facts.observed is None else facts.observed.health,
     )
-    if health.ok is False:
-        yield UNHEALTHY.on(
-            node,
-            outcome=Outcome.VIOLATED,
-            expected=_HEALTHY,
-            observed=health.message,
-            message=f"node {node.full_name} is not healthy: {health.message}",
-        )
-    elif health.ok is None:
-        yield UNHEALTHY.on(
-            node,
-            outcome=Outcome.UNVERIFIABLE,
-            expected=_HEALTHY,
-            observed="unknown",
-            message=f"nothing shows that node {node.full_name} is healthy: {health.message}",
-        )
+    if not health.ok:
+        yield _unhealthy(node, health)
+
+
+def _unhealthy(node: PlannedNode, health: HealthReport) -> Finding:
+    outcome = Outcome.UNVERIFIABLE if health.ok is None else Outcome.VIOLATED
+    return UNHEALTHY.on(node, outcome=outcome, expected="healthy", observed=health.message)
 
 
 def _faults(facts: NodeFacts) -> Iterator[Finding]:
     """Find action servers of which the handler raised at the last goal, whatever is asked."""
-    node, report = facts.node, facts.configuration
+    report = facts.configuration
     for each in () if report is None or facts.absent else report.endpoints:
         if each.fault:
             wrong = f"{each.kind.noun} {each.name!r}: {each.fault}"
-            yield UNHEALTHY.on(
-                node,
-                outcome=Outcome.VIOLATED,
-                expected=_HEALTHY,
-                observed=wrong,
-                message=f"node {node.full_name} is not healthy: {wrong}",
-            )
+            yield _unhealthy(facts.node, HealthReport(ok=False, message=wrong))

@@ -78,16 +78,6 @@ def test_two_captures_of_one_system_are_the_same_text(tmp_path: Path, foreign: i
     assert yaml.safe_load(first.stdout)["discovery"] == {"domain_id": foreign, "range": "localhost"}
 
 
-def test_a_namespace_alone_is_captured_and_verified(tmp_path: Path, foreign: int) -> None:
-    manifest = tmp_path / "left.lifecycle.yaml"
-    options = ("--namespace", "/left", "--system", "left", "--output", str(manifest), *_SETTLES)
-    captured = verb("capture", "--domain", str(foreign), *options, runtime=tmp_path)
-    assert captured.returncode == ExitCode.OK, captured.stderr
-    assert [node.name for node in load(str(manifest), {}).manifest.nodes] == ["managed", "scanner"]
-    judged = verb("verify", str(manifest), *ENOUGH, "--strict", runtime=tmp_path)
-    assert judged.returncode == ExitCode.OK, judged.stdout
-
-
 def test_our_own_nodes_tell_their_depth_their_flows_and_their_process(
     tmp_path: Path, fresh_domain: int
 ) -> None:

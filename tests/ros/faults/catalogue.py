@@ -305,7 +305,7 @@ GRAPH = (
         rule="graph.missing-endpoint",
         options=("--timeout", "6"),
         subject="/dock",
-        message="/dock has no action server of /dock, which is declared",
+        message="the action server of /dock in /dock is declared, and is not there",
     ),
     Fault(
         name="a command ignores its remap and publishes elsewhere",
@@ -355,7 +355,7 @@ DEFINITIONS = (
         exit_code=ExitCode.VIOLATED,
         rule="graph.type-definition-differs",
         subject="/chatter",
-        message="its std_msgs/msg/String is not that of the definition installed here",
+        message="which is installed here",
     ),
     Fault(
         name="a client was built from another definition of its service",
@@ -593,7 +593,7 @@ OUTSIDERS = (
         exit_code=ExitCode.VIOLATED,
         rule="graph.unattributed-endpoint",
         subject="/chatter",
-        message="a participant of Cyclone DDS, at 127.0.0.1",
+        message="(at 127.0.0.1, GID ",
         options=("--strict", "--timeout", "6"),
     ),
     Fault(

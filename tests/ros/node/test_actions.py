@@ -259,7 +259,7 @@ def test_a_missing_handler_and_one_too_many_are_told_at_configure(
         ),
         (
             "cannot serve action server 'cuont' of /it: no method of Choosy is decorated with "
-            "@on_action('cuont'); did you mean it where @on_action('count') stands?"
+            "@on_action('cuont')"
         ),
     ]
     assert driver.state("/it") == (1, "unconfigured")

@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 from lifecycle_driver import Driver
 from planning import publisher, subscription
-from std_msgs.msg import String
+from std_msgs.msg import Empty, String
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, codec, on_message
@@ -43,7 +43,8 @@ def test_an_open_node_declares_more_while_it_is_active(driver: Driver, active: A
     node = active(It, publisher("out"))
     before = configuration(driver).checksum
     heard: list[str] = []
-    node.declare_publisher("news", String, lossy=True, size_bytes=200)
+    node.declare_publisher("news", String)
+    node.hint("news", lossy=True, size_bytes=200)
     node.declare_subscription("news", String, callback=lambda m: heard.append(m.data))
     node.declare_service("ask", Trigger, callback=answer)
     node.declare_client("ask", Trigger)
@@ -134,8 +135,9 @@ def test_what_is_declared_twice_or_made_impossible_leaves_the_node_as_it_was(
 ) -> None:
     node = active(It, publisher("out"))
     node.declare_publisher("news", String)
-    with pytest.raises(LifecycleError, match=r"declares it as std_msgs/msg/String already$"):
-        node.declare_publisher("news", String)
+    node.declare_publisher("news", String)
+    with pytest.raises(LifecycleError, match=r"it is declared as std_msgs/msg/String already$"):
+        node.declare_publisher("news", Empty)
     with pytest.raises(Exception, match="topic name"):
         node.declare_publisher("no topic", String)
     assert [name for name, _ in node.mappings] == ["publishers/out", "publishers/news"]
@@ -187,10 +189,7 @@ def test_hints_of_a_manifests_endpoint_are_reported(driver: Driver, active: Acti
     class Hinting(LifecycleNode):
         def __init__(self) -> None:
             super().__init__()
-            self.hint("publishers/out", lossy=False)
-
-        def on_configure(self) -> None:
-            self.hint("out", size_bytes=70_000)
+            self.hint("publishers/out", lossy=False, size_bytes=70_000)
 
         @on_message("in")
         def hear(self, message: String) -> None: ...

@@ -292,8 +292,8 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
         (
             "nothing",
             (
-                "cannot use 'hosted:nothing': it returns None and must return its nodes; it must "
-                "neither spin nor destroy them: the host does"
+                "cannot use 'hosted:nothing': it returned None, not /one; return the node, or a "
+                "list of nodes; the host spins and destroys them"
             ),
         ),
         (

@@ -213,7 +213,9 @@ def test_an_unknown_endpoint_is_a_key_error_that_lists_what_is_declared(
     with pytest.raises(UnknownEndpointError) as unknown:
         chatty.publisher("outt")
     assert str(unknown.value) == (
-        "cannot find publisher 'outt' of /chatty; did you mean 'out'? declared: 'out'"
+        "cannot find endpoint 'publishers/outt' of /chatty; did you mean 'publishers/out'? "
+        "declared: 'publishers/out', 'subscriptions/in', 'service_servers/reset', "
+        "'service_clients/other'"
     )
     with pytest.raises(KeyError):
         chatty.client("nothing")
@@ -435,25 +437,6 @@ def test_a_node_without_a_manifest_declares_in_code_and_drives_itself(
     driver.spin_until(lambda: node.heard)
     assert node.is_active
     assert driver.node.count_publishers("/here/out") == 1
-
-
-def test_declaring_twice_in_code_names_both_places(context: rclpy.Context) -> None:
-    node = LifecycleNode("twice", context=context)
-    node.declare_publisher("out", String)
-    with pytest.raises(LifecycleError) as error:
-        node.declare_publisher("out", String)
-    file = __file__
-    line = _line_of('node.declare_publisher("out", String)')
-    assert str(error.value) == (
-        f"{file}:{line + 2}: cannot declare 'out' in publishers as std_msgs/msg/String: "
-        f"{file}:{line} declares it as std_msgs/msg/String already"
-    )
-    node.destroy_node()
-
-
-def _line_of(text: str) -> int:
-    with open(__file__, encoding="utf-8") as file:  # noqa: PTH123
-        return 1 + [line.strip() for line in file].index(text)
 
 
 def test_a_mode_that_does_not_exist_is_refused(context: rclpy.Context) -> None:

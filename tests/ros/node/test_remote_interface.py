@@ -109,22 +109,12 @@ def test_the_answer_to_map_to_comes_when_the_handover_is_over(
             "cannot find connection 'net' of /it; connected: none but its own participant, ''",
         ),
         (
-            "map_to",
-            "out",
-            texts("net"),
-            (
-                "cannot use the value given for 'out': the connection's name is a string, type 4, "
-                "not type 9; write {type: 4, string_value: '…'}"
-            ),
-        ),
-        (
             "connect_to",
             "net",
             ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=7),
             (
-                "cannot use the value given for 'net': a URL or several is a string or an array of "
-                "strings, type 4 or 9, not type 2; write {type: 4, string_value: '…'} or {type: 9, "
-                "string_array_value: ['…']}"
+                "cannot use the value given for 'net': it is no string, and no strings; write "
+                "{type: 4, string_value: '…'} or {type: 9, string_array_value: ['…']}"
             ),
         ),
         (

@@ -21,7 +21,6 @@ NOT_HEARD = frozenset(
         "graph.unmatched-flow",
         "graph.unmatched-link",
         "run.deadline",
-        "state.unverifiable",
         "state.wrong-state",
     )
 )

@@ -57,6 +57,25 @@ class Sleeper(Node):
         self.get_logger().info("slept")
 
 
+class Raising(Node):
+    """Raises in a coroutine, a moment after it was released."""
+
+    def __init__(self) -> None:
+        super().__init__("raising")
+        self.create_timer(0.2, self.raise_)
+
+    async def raise_(self) -> None:
+        raise OSError("the sensor is on fire")
+
+
+class Leaving(Node):
+    """Destroys itself a moment after it was released; its process goes on."""
+
+    def __init__(self) -> None:
+        super().__init__("leaving")
+        self.create_timer(0.2, self.destroy_node)
+
+
 class Listener(Node):
     """Prints what it hears."""
 

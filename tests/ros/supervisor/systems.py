@@ -173,6 +173,17 @@ class Listener(LifecycleNode):
             print(f"heard {message.data}", flush=True)
 
 
+class Leaving(LifecycleNode):
+    """Destroys itself a moment after it was activated; its process goes on."""
+
+    async def leave(self) -> None:
+        await self.sleep(0.2)
+        self.destroy_node()
+
+    def on_activate(self) -> None:
+        self.executor.create_task(self.leave)
+
+
 class Crossing(LifecycleNode):
     """Hears of several topics, and publishes some of its own."""
 

@@ -63,15 +63,14 @@ def test_a_flow_over_ipv6_shows_its_3_tuple_and_that_no_label_is_set(
     rows = list(csv.DictReader(io.StringIO(cells.stdout)))
     assert {(row["effective_transport"], row["flow_label"]) for row in rows} == {("udpv6", "unset")}
     (flow,) = json.loads(document.stdout)
-    lines = text.stdout.splitlines()[1:]
-    assert len(flow["tuples"]) == len(lines) == len(rows)
-    for one, row, line in zip(flow["tuples"], rows, lines, strict=True):
+    assert len(flow["tuples"]) == len(rows)
+    for one, row in zip(flow["tuples"], rows, strict=True):
         source, destination = (
             f"[{one[f'{end}_address']}]:{one[f'{end}_port']}" for end in ("source", "destination")
         )
         assert (one["source_address"], one["flow_label"]) == (row["source_address"], 0)
-        assert f"{source} {destination} udp unset" in " ".join(line.split())
-        assert f"    udp {source} → {destination} flow_label unset\n" in judged.stdout
+        for shown in (text, judged):
+            assert f"    udp {source} → {destination} flow_label unset\n" in shown.stdout
 
 
 _CHATTER = {"topic": "/chatter", "from": "talker", "to": "listener"}

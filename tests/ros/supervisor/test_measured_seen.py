@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
 import signal
@@ -53,8 +54,8 @@ def test_numbers_are_seen_fresh_by_every_way_and_fill_no_journal(
         assert flow["rate_hz"] == pytest.approx(50, rel=0.2)
 
         text = verb("flows", "pair", *ENOUGH, runtime=tmp_path).stdout.splitlines()
-        assert text[0].split()[3:7] == ["rate_hz", "p50_ms", "p99_ms", "lost"]
-        assert re.search(r" \d+\.\d ███ +[\d.]+ +[\d.]+!███ +\d+/\d+ .* violated$", text[1])
+        assert text[0].split()[1:7] == ["Hz", "p50", "ms", "p99", "ms", "lost"]
+        assert re.search(r"^violated +\d+\.\d ███ +[\d.]+ +[\d.]+!███ +\d+/\d+ ", text[1])
         (flow,) = json.loads(
             verb("flows", "pair", *ENOUGH, "--format", "json", runtime=tmp_path).stdout
         )
@@ -133,10 +134,11 @@ def test_a_record_has_a_row_a_second_and_ends_with_its_supervisor(
             records.send_signal(signal.SIGINT)
             assert records.wait(20) == ExitCode.INTERRUPTED
             assert records.stderr is not None
-            assert records.stderr.read().strip() == f"3 rows in {str(file)!r}"
+            assert re.search(rf"\d rows in '{file}'", records.stderr.read())
         rows = list(csv.DictReader(file.read_text().splitlines()))
         assert {each["outcome"] for each in rows} == {"violated"}
-        assert [round(float(each["seconds"])) for each in rows] == [0, 1, 2]
+        seconds = [float(each["seconds"]) for each in rows]
+        assert all(0 < b - a < 2 for a, b in itertools.pairwise(seconds)), seconds
         assert float(rows[-1]["rate_hz"]) == pytest.approx(50, rel=0.2)
 
         file.unlink()

@@ -203,5 +203,5 @@ def test_parameters_that_nobody_tells_are_unverifiable(
         run.assert_gate_held()
         (finding,) = run.verdict["findings"]
         assert (finding["rule"], finding["node"]) == ("param.unverifiable", "/arm")
-        assert finding["expected"] == ", ".join(sorted(DECLARED))
+        assert finding["expected"] == f"parameters {', '.join(sorted(DECLARED))}"
         assert why in finding["message"]

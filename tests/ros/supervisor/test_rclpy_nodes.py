@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +130,7 @@ def test_a_plain_node_does_nothing_while_the_gate_is_closed(
     with running.up(manifest, "--timeout", "2", runtime=tmp_path) as up:
         assert up.finish() == 4
         assert [each["message"] for each in up.verdict["findings"]] == [
-            "/talker has no publisher of /shouts, which is declared"
+            "the publisher of /shouts in /talker is declared, and is not there"
         ]
         assert "heard" not in log_of(up, "listener")
         assert "/words is dropped" in log_of(up, "talker").replace("'", "").replace(
@@ -204,6 +205,48 @@ def test_an_events_executor_survives_that_endpoints_are_destroyed_while_peers_co
         ends = [each for each in up.of_kind("process") if each["state"] == "exited"]
         assert ends
         assert not [each for each in ends if "SIGSEGV" in str(each)]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("executor", ["single", "events"])
+def test_what_a_coroutine_raises_ends_the_process_with_its_traceback(
+    executor: str, fresh_domain: int, tmp_path: Path
+) -> None:
+    raising = node("Raising", managed=False, executor=executor)
+    manifest = running.write(tmp_path, fresh_domain, {"raising": raising})
+    with running.up(manifest, "--stop-after", "20", runtime=tmp_path) as up:
+        assert up.until("process", state="exited")["detail"] == "exit status 1"
+        assert "OSError: the sensor is on fire" in log_of(up, "raising")
+
+
+@pytest.mark.parametrize("executor", ["single", "events"])
+def test_a_node_that_destroys_itself_in_a_process_that_goes_on_is_shown_as_dead(
+    executor: str, fresh_domain: int, tmp_path: Path, wait_until: Any
+) -> None:
+    leaving = {
+        key: node(reference, managed=managed, process="shared", executor=executor)
+        for key, reference, managed in (
+            ("plain", "Leaving", False),
+            ("managed", "tests.ros.supervisor.systems:Leaving", True),
+            ("quiet", "tests.ros.supervisor.systems:Quiet", True),
+        )
+    }
+    manifest = running.write(tmp_path, fresh_domain, leaving)
+
+    def shown() -> dict[str, tuple[str, str]]:
+        done = verb("status", str(manifest), "--format", "json", runtime=tmp_path)
+        nodes = json.loads(done.stdout)["nodes"]
+        return {each["node"]: (each["state"], each["died"]) for each in nodes}
+
+    with running.up(manifest, runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        gone = f"destroyed by its own code; pid {up.pid_of('shared')} runs on"
+        wait_until(lambda: [died for _, died in shown().values()].count(gone) == 2)
+        assert shown() == {"/plain": ("", gone), "/managed": ("", gone), "/quiet": ("active", "")}
+        up.until_found("graph.missing-node", "/managed")
+        assert verb("down", str(manifest), runtime=tmp_path).returncode == 0
+        up.finish()
+        assert "Traceback" not in log_of(up, "shared")
 
 
 @pytest.mark.thorough

@@ -19,7 +19,6 @@ system: arm
 arguments:
   rate: {default: "$(command touch ran)", description: frames per second}
   robot: {description: its name}
-machines: {robot: {address: 192.0.2.1}}
 nodes:
   camera: {run: {attach: true}, namespace: /left}
   viewer: {rum: {attach: true}}
@@ -30,7 +29,6 @@ nodes:
 def place(tmp_path: Path) -> Path:
     (tmp_path / "arm.lifecycle.yaml").write_text(MANIFEST)
     (tmp_path / "notes.txt").write_text("")
-    (tmp_path / "log/2026-11-23-13-00-00-000000-host-1-17-arm").mkdir(parents=True)
     return tmp_path
 
 
@@ -46,7 +44,6 @@ def _asked(line: str, place: Path) -> list[str]:
         env={
             **os.environ,
             "XDG_RUNTIME_DIR": str(place),
-            "ROS_LOG_DIR": str(place / "log"),
             "_LIFECYCLE_COMPLETE": "bash_complete",
             "COMP_WORDS": line,
             "COMP_CWORD": str(len(line.split(" ")) - 1),
@@ -70,7 +67,6 @@ def _asked(line: str, place: Path) -> list[str]:
         ("lifecycle run arm.lifecycle.yaml ", ["plain,camera", "plain,viewer"]),
         ("lifecycle up arm.lifecycle.yaml r", ["plain,rate:=", "plain,robot:="]),
         ("lifecycle up nothing.lifecycle.yaml r", []),
-        ("lifecycle history ", ["plain,2026-11-23-13-00-00-000000-host-1-17-arm"]),
     ],
 )
 def test_what_can_come_next_is_offered_and_nothing_is_run(

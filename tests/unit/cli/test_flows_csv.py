@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from lifecycle.cli.flow_tables import COLUMNS, flows_to_csv
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.measure.flows import NUMBERS, FlowMeasurement
-from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 from tests.builders import nfe
@@ -61,18 +61,6 @@ def test_a_flow_is_one_line_with_its_5_tuple_dscp_and_verdict() -> None:
 def test_a_pair_with_several_flows_has_one_line_each() -> None:
     report = replace(VIDEO, destination=(nfe("10.0.0.2", 7001), nfe("10.1.0.2", 7001)))
     assert [row["destination_address"] for row in rows(report)] == ["10.0.0.2", "10.1.0.2"]
-
-
-def test_an_ipv6_flow_has_its_label_in_five_hex_digits_or_says_that_none_is_set() -> None:
-    def cell(flow_label: int) -> str:
-        source = replace(
-            nfe("fd00::1", 7411), internet_protocol=InternetProtocol.IPV6, flow_label=flow_label
-        )
-        end = replace(nfe("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
-        (row,) = rows(replace(VIDEO, source=(source,), destination=(end,)))
-        return row["flow_label"]
-
-    assert (cell(0x12345), cell(0xABC), cell(0)) == ("0x12345", "0x00abc", "unset")
 
 
 def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:

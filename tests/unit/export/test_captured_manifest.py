@@ -281,13 +281,6 @@ def test_a_type_that_is_no_ros_type_and_a_state_that_verify_refuses_are_gaps() -
     assert "    state: inactive\n" in to_manifest(system)
 
 
-def test_some_namespaces_leave_the_others_open(tmp_path: Path) -> None:
-    system = captured(namespaces=("left",))
-    assert [node.full_name for node in system.nodes] == ["/left/base", "/left/scanner"]
-    plan = build_plan(loaded(system, tmp_path).manifest, environment={})
-    assert verify(plan, ASKED, stage=Stage.ACTIVE).findings == ()
-
-
 def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
     tmp_path: Path,
 ) -> None:

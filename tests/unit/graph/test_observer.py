@@ -392,7 +392,7 @@ def test_a_parameter_that_is_waited_for_is_read_too_by_looks_at_all_and_at_its_n
     observer: Graph, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/viewer")
-    ready = Readiness(by=ReadyBy.PARAMETER, name="ready", value=True)
+    ready = Readiness(by=ReadyBy.PARAMETER, name="ready")
     made = with_parameter(plan("foreign", "viewer"), "foreign", "viewer")
     after = After(node="foreign", condition=ready, at=made.nodes[0].at)
     made = replace(made, nodes=(made.nodes[0], replace(made.nodes[1], after=(after,))))

@@ -11,7 +11,6 @@ import pytest
 from lifecycle.manifest.installed_types import (
     find_resource,
     list_resources,
-    nearest_type,
     search_prefixes,
     types_of,
 )
@@ -34,28 +33,8 @@ def test_a_declared_type_exists(prefix: Path) -> None:
     assert types_of("sensor_msgs", [prefix]) == ("msg/Image", "msg/Imu", "srv/SetCameraInfo")
 
 
-@pytest.mark.parametrize(
-    ("type_", "nearest"),
-    [
-        ("sensor_msgs/msg/IMU", "sensor_msgs/msg/Imu"),
-        ("sensor_msgs/msg/Imagge", "sensor_msgs/msg/Image"),
-        ("sensor_msgs/srv/Image", "sensor_msgs/msg/Image"),
-        ("sensor_msgs/msg/SetCameraInfo", "sensor_msgs/srv/SetCameraInfo"),
-        ("sensor_msgs/msg/Zzz", ""),
-    ],
-)
-def test_a_type_that_its_package_lacks_names_the_nearest_spelling(
-    prefix: Path, type_: str, nearest: str
-) -> None:
-    assert nearest_type(type_, [prefix]) == nearest
-
-
-@pytest.mark.parametrize(("package", "nearest"), [("sensr_msgs", "sensor_msgs"), ("zzz", "")])
-def test_a_package_that_is_not_installed_is_told_apart(
-    prefix: Path, package: str, nearest: str
-) -> None:
-    assert types_of(package, [prefix]) is None
-    assert nearest_type(f"{package}/msg/Image", [prefix]) == nearest
+def test_a_package_that_is_not_installed_is_told_apart(prefix: Path) -> None:
+    assert types_of("zzz", [prefix]) is None
 
 
 def test_the_first_prefix_that_has_the_package_decides(prefix: Path, tmp_path: Path) -> None:

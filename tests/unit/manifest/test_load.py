@@ -226,7 +226,6 @@ def test_endpoints(every_key: Manifest) -> None:
         (EndpointKind.SERVICE_SERVER, "~/mute", "std_srvs/srv/SetBool"),
         (EndpointKind.SERVICE_CLIENT, "/other/reset", "std_srvs/srv/Trigger"),
     ]
-    assert interface.source == ""
     assert [each.qos for each in interface.endpoints[1:]] == [
         PRESETS["default"],
         PRESETS["services_default"],
@@ -412,9 +411,8 @@ def test_yaml_1_2_scalars_reach_parameters_as_they_are(monkeypatch: pytest.Monke
     ]
 
 
-def test_an_interface_by_reference_names_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interface_by_reference_is_that_of_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
     (talker,) = _corpus("interface_by_reference", monkeypatch).nodes
-    assert talker.interface.source == "local://parts/talker.nodl.yaml"
     assert [each.name for each in talker.interface.endpoints] == ["chatter"]
     assert [each.name for each in talker.interface.parameters] == ["rate"]
 

@@ -68,7 +68,6 @@ def read(path: Path, text: str) -> tuple[Interface, list[str]]:
 def test_a_whole_document_becomes_an_interface(tmp_path: Path) -> None:
     interface, found = read(tmp_path / "imu.nodl.yaml", WHOLE)
     assert found == []
-    assert interface.source == "local://imu.nodl.yaml"
     file = str(tmp_path / "imu.nodl.yaml")
 
     def at(line: int, column: int, path: str) -> Position:
@@ -248,7 +247,7 @@ def test_the_number_of_documents_is_bounded(tmp_path: Path) -> None:
 def test_a_missing_file_is_reported_at_the_reference_with_the_nearest_name(tmp_path: Path) -> None:
     (tmp_path / "camera.nodl.yaml").write_text(publisher("a"))
     interface, found = followed("local://camra.nodl.yaml", base=tmp_path, at=AT)
-    assert interface == Interface(source="local://camra.nodl.yaml", has_all_parameters=True)
+    assert interface == Interface(has_all_parameters=True)
     assert [str(each).replace(f"{tmp_path}/", "") for each in found] == [
         (
             "system.lifecycle.yaml:7:16: nodes.imu.interface: cannot find "

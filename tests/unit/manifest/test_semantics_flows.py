@@ -110,9 +110,7 @@ def test_a_best_effort_subscription_is_told_that_it_sends_nothing_to_mark() -> N
 
 def test_a_subscription_has_one_mark_too() -> None:
     (found,) = check(acknowledging(Reliability.RELIABLE, transport_priority=0x20))
-    assert found.message == (
-        "cannot give subscription 's0' both dscp and transport_priority: each is the whole mark"
-    )
+    assert found.message == ("cannot give subscription 's0' both dscp and transport_priority")
 
 
 def test_the_mark_of_a_subscription_makes_no_flow_unique() -> None:

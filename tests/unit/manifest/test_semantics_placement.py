@@ -44,18 +44,6 @@ def test_participants_that_own_flows_count_against_the_ports(
     assert [each.startswith(expected) for each in found] == [True] * bool(participants)
 
 
-def test_unique_subscriptions_share_four_hundred_ports_of_a_host(findings: Findings) -> None:
-    need = "{unique: strictly_required}"
-    assert findings(many(398, flows=need, kind="subscriptions")) == []
-    assert findings(many(399, flows=need, kind="subscriptions")) == [
-        (
-            "check.ports 7:3: nodes.n: cannot give 399 subscriptions a port of their own "
-            "on 'robot': Fast DDS takes them from 7000–7399, and one for each of 2 participants; "
-            "ask for fewer unique subscriptions"
-        )
-    ]
-
-
 LOCALHOST = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 ELSEWHERE = f"environment: {{{LOCALHOST}: SUBNET}}"
 

@@ -32,10 +32,10 @@ def _message(path: str | Path) -> str:
     [
         (lambda _: None, "cannot open '{path}': No such file or directory"),
         (Path.mkdir, "cannot read a directory as a manifest; name a regular file"),
-        (os.mkfifo, "cannot read a FIFO as a manifest; name a regular file"),
+        (os.mkfifo, "cannot read a special file as a manifest; name a regular file"),
         (
             lambda path: path.symlink_to("/dev/zero"),
-            "cannot read a character device as a manifest; name a regular file",
+            "cannot read a special file as a manifest; name a regular file",
         ),
         (
             lambda path: path.symlink_to(path),

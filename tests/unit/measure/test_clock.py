@@ -14,12 +14,7 @@ from lifecycle.measure.clock import JUDGED_S, SAME_CLOCK, ClockComparison, Clock
 from lifecycle.measure.counter import WARM_UP_S, Counter
 from lifecycle.measure.flows import CLOCKS_S, Bound, Judgement, Kind, judge
 from lifecycle.measure.sample import (
-    ERROR,
-    LAST_BUCKET,
-    LONGEST_NS,
     Sample,
-    least_ns,
-    signed_buckets_of,
 )
 
 NS = 10**9
@@ -169,14 +164,6 @@ def test_of_several_clocks_holds_what_holds_for_each() -> None:
     assert (both.offset_ms, both.uncertainty_ms) == (0.625, 0.625)
 
 
-@given(st.integers(-LONGEST_NS, LONGEST_NS))
-def test_a_bucket_of_a_difference_holds_it_within_the_known_error(delay_ns: int) -> None:
-    bucket = signed_buckets_of((delay_ns,))[0]
-    assert least_ns(bucket) <= delay_ns <= least_ns(bucket) + abs(delay_ns) * ERROR + 1
-    assert abs(bucket) <= LAST_BUCKET
-    assert signed_buckets_of((delay_ns - 1,))[0] <= bucket
-
-
 def counted(
     arrivals: Iterable[tuple[float, float]], *, ahead_ns: int, until_s: float, network: float = 0.5
 ) -> Sample:
@@ -219,9 +206,7 @@ def test_delays_across_clocks_are_exact_within_the_known_error(
         assert found_ms is not None
         rank = math.ceil(quantile * len(exact_ms) - 1e-9)
         # A double has milliseconds of centuries to a part of a microsecond.
-        assert found_ms + ahead_ns / 1e6 == pytest.approx(
-            exact_ms[rank - 1], abs=max(delays_ms) * ERROR + 2e-3
-        )
+        assert found_ms + ahead_ns / 1e6 == pytest.approx(exact_ms[rank - 1], abs=0.011)
 
 
 def test_what_was_received_before_counting_began_does_not_count_by_another_clock() -> None:
@@ -238,32 +223,7 @@ def test_rate_and_loss_do_not_depend_on_the_other_clock(ahead_ns: int) -> None:
     assert (sample.messages, sample.lost) == (250, 0)
     found_ms = sample.received.quantile_ms(0.99)
     assert found_ms is not None
-    assert found_ms + ahead_ns / 1e6 == pytest.approx(1.5, abs=0.05)
-
-
-@pytest.mark.parametrize(
-    ("before_ms", "delay_ms", "error_ms"),
-    [(4000.0, 3.0, 0.01), (3.0, 4000.0, 1.1), (1.0, 3.6e6, 1.1), (1.0, 2e7, 0.01)],
-)
-def test_delays_have_small_buckets_again_after_a_clock_was_set(
-    before_ms: float, delay_ms: float, error_ms: float
-) -> None:
-    before = [(at_s, before_ms) for at_s, _ in steady(0, 1)]
-    then = [(1 + at_s, delay_ms) for at_s, _ in steady(0, 6)]
-    sample = counted([*before, *then], ahead_ns=0, until_s=8, network=1.0)
-    assert sample.used.quantile_ms(0.99) == pytest.approx(delay_ms, abs=error_ms)
-    assert sample.messages == 350
-
-
-def test_no_message_is_forgotten_where_delays_differ_by_more_than_small_buckets_hold() -> None:
-    delays_ms = [each for each in (3.0, 300.0, 5.0, 600.0, 3.0) for _ in range(50)]
-    arrivals = [(at_s, delay_ms) for (at_s, _), delay_ms in zip(steady(0), delays_ms, strict=True)]
-    sample = counted(arrivals, ahead_ns=0, until_s=5.5)
-    assert sample.used.messages >= 200
-    for quantile, delay_ms in ((0.3, 3.0), (0.45, 5.0), (0.6, 300.0), (0.99, 600.0)):
-        found_ms = sample.used.quantile_ms(quantile)
-        assert found_ms is not None
-        assert delay_ms - 2 * 600 * ERROR < found_ms <= delay_ms
+    assert found_ms + ahead_ns / 1e6 == pytest.approx(1.5, abs=0.011)
 
 
 def test_what_arrives_after_our_own_clock_was_set_back_is_counted() -> None:
@@ -274,6 +234,13 @@ def test_what_arrives_after_our_own_clock_was_set_back_is_counted() -> None:
         info = dict.fromkeys(("source_timestamp", "received_timestamp"), wall_ns)
         counter.arrived(now_ns, wall_ns, {**info, "publication_sequence_number": number})
     assert counter.sample(4 * NS).messages == 3
+
+
+def test_delays_all_over_take_constant_memory_and_long_ones_count_as_long() -> None:
+    arrivals = [(number / 10_000, 0.2 * number) for number in range(10_000)]
+    sample = counted(arrivals, ahead_ns=0, until_s=1.1)
+    assert (sample.messages, sample.used.messages) == (10_000, 5_000)
+    assert len(sample.used.buckets) == 4096
 
 
 BOUND = Bound(kind=Kind.DELAY, most=5.0)
@@ -312,4 +279,4 @@ def test_better_exchanges_are_waited_for_within_the_probation() -> None:
     sample = counted(steady(1.0, 5.5), ahead_ns=0, until_s=5.5)
     unknown = judge(BOUND, sample, clock=None)
     assert (unknown.kept, unknown.needs_clocks, unknown.observed) == (None, True, "")
-    assert judged(1.0, 0.25).observed == "delay p99 1 ms ± 0.25 ms"
+    assert judged(1.0, 0.25).observed == "delay p99 1 ms ± 0.26 ms"

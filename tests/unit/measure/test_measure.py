@@ -84,10 +84,9 @@ def test_no_message_has_no_quantile_and_what_came_too_early_counts_as_no_delay()
     assert Measured(active_s=1.0).of("/a") is None
     assert buckets_of((-5,))[0] == 0
     too_long = buckets_of((LONGEST_NS * 4,))[0]
-    both = Delays.of(({too_long: 1}, {-too_long: 2}))
-    assert both == Delays(buckets=((-LAST_BUCKET, 2), (LAST_BUCKET, 1)))
-    edges = (-129, -128, 127, 128, 129, 191, 192)
-    assert [least_ns(each) for each in edges] == [-131, -129, 127, 128, 130, 254, 256]
+    assert Delays.of(({too_long: 1},)) == Delays(buckets=((LAST_BUCKET, 1),))
+    edges = (127, 128, 129, 191, 192)
+    assert [least_ns(each) for each in edges] == [127, 128, 130, 254, 256]
 
 
 def test_ranks_and_late_messages_are_counted_to_the_nanosecond() -> None:

@@ -14,15 +14,10 @@ from lifecycle.network.medium import (
     DEFAULT_TCP,
     NETWORK_MEDIA,
     RMW_DISCOVERY,
-    RTPS_OVERHEAD_BYTES,
-    SAFE_DATAGRAM_BYTES,
-    SCHEMES,
     UDP_UNICAST,
     FlowTransport,
     Medium,
-    datagram_bytes,
     is_fragmented,
-    max_unfragmented,
     medium_of,
     udp_to,
 )
@@ -38,8 +33,7 @@ def test_a_medium_is_its_word_in_text_in_json_and_as_a_key() -> None:
 
 
 def test_connections_are_made_of_the_same_media_however_they_are_listed() -> None:
-    assert {*CONNECTABLE} == {*SCHEMES}
-    assert {*Medium} - {*SCHEMES} == {Medium.TCPV6, Medium.INTRAPROCESS}
+    assert {*Medium} - {*CONNECTABLE} == {Medium.TCPV6, Medium.INTRAPROCESS}
     assert {*Medium} - NETWORK_MEDIA == {Medium.SHM, Medium.INTRAPROCESS}
 
 
@@ -78,7 +72,6 @@ def test_the_medium_to_an_address_is_udp_over_its_version_of_ip() -> None:
 
 def test_media_are_listed_in_the_orders_that_messages_have() -> None:
     assert ", ".join(CONNECTABLE) == "shm, udpv4, udpv6, udpm, tcpv4"
-    assert ", ".join(SCHEMES) == "udpv4, udpv6, udpm, tcpv4, shm"
     assert ", ".join(UDP_UNICAST) == "udpv4, udpv6"
     assert (RMW_DISCOVERY, DEFAULT_TCP) == ("udpv4", "tcpv4")
 
@@ -115,21 +108,12 @@ def test_what_a_manifest_asks_for_is_met_by_some_media(
     assert asked.builtin == builtin
 
 
-@pytest.mark.parametrize(("ipv6", "payload"), [(False, 1472), (True, 1452)])
-def test_what_ip_and_udp_leave_of_an_ethernet_packet(ipv6: bool, payload: int) -> None:
-    assert max_unfragmented(ipv6=ipv6) == payload
-
-
-def test_the_safe_size_fits_ethernet() -> None:
-    assert max_unfragmented(ipv6=True) >= SAFE_DATAGRAM_BYTES
-
-
-@pytest.mark.parametrize(("message", "datagram"), [(4, 108), (5, 112), (1368, 1472)])
-def test_a_message_is_padded_and_wrapped_by_rtps(message: int, datagram: int) -> None:
-    assert datagram_bytes(message) == datagram
-    assert RTPS_OVERHEAD_BYTES == 104
-
-
-def test_the_largest_message_that_ip_leaves_whole_on_ethernet_has_1368_bytes() -> None:
-    assert not is_fragmented(1368, max_unfragmented(ipv6=False))
-    assert is_fragmented(1369, max_unfragmented(ipv6=False))
+@pytest.mark.parametrize(
+    ("address", "limit", "whole"),
+    [("", None, 1368), ("10.0.0.1", None, 1368), ("fd77::1", None, 1348), ("", 1400, 1296)],
+)
+def test_a_message_is_padded_and_wrapped_by_rtps_in_a_datagram_that_ip_leaves_whole(
+    address: str, limit: int | None, whole: int
+) -> None:
+    assert not is_fragmented(whole, address, limit)
+    assert is_fragmented(whole + 1, address, limit)

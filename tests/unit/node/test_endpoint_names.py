@@ -44,7 +44,7 @@ def test_a_topic_that_is_called_like_a_spelling_is_found_by_it() -> None:
             "vidoe",
             DECLARED,
             (
-                "cannot find endpoint 'vidoe' of /camera; did you mean 'publishers/video'? "
+                "cannot find endpoint 'vidoe' of /camera; "
                 "declared: 'publishers/video', 'subscriptions//robot/command', 'publishers/echo', "
                 "'subscriptions/echo'"
             ),

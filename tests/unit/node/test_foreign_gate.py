@@ -65,6 +65,7 @@ def _node(activate: Any) -> ForeignNode:
         "gate": NodeGate(),
         "_machine": Machine(activate),
         "_is_constructed": True,
+        "is_destroyed": False,
         "_let_through": False,
         "_supervisor": "robot",
         "spec": types.SimpleNamespace(timeouts=Timeouts(activate_s=0.05)),

@@ -112,29 +112,6 @@ def test_what_arrives_while_open_is_counted_since_then() -> None:
     assert gate.measured() is None
 
 
-def test_a_subscription_that_is_made_anew_is_counted_on() -> None:
-    gate = NodeGate()
-    gate.open()
-
-    def made() -> FakeSubscription:
-        subscription = FakeSubscription(lambda _: None)
-        gate.add(subscription, GatedSubscription(subscription, gate))
-        return subscription
-
-    def counter() -> object:
-        (counted,) = gate._counted
-        return counted.counter
-
-    first = made()
-    before = counter()
-    gate.remove(first)
-    made()
-    assert counter() is before
-    gate.close()
-    gate.open()
-    assert counter() is not before
-
-
 def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> None:
     received: list[object] = []
     gate = NodeGate()

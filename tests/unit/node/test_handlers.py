@@ -88,7 +88,7 @@ def test_two_handlers_for_one_subscription_are_an_error() -> None:
     with pytest.raises(LifecycleError) as error:
         match(Twice(), [SCAN], name="/base")
     assert str(error.value) == (
-        "cannot handle subscription 'scan' of /base twice: Twice.first and Twice.second"
+        "cannot use both handlers Twice.first and Twice.second: @on_message('scan')"
     )
 
 

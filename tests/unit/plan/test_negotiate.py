@@ -66,7 +66,7 @@ def party(key: str, *endpoints: PlannedEndpoint, host: str = HERE, **rest: objec
 def media(graph: DataLayerGraph) -> dict[str, tuple[str, str]]:
     """What carries the data to each subscribing node, and why."""
     assert graph.problems == ()
-    return {each.subscription: (each.medium, each.reason) for each in graph.flows}
+    return {each.subscription: (each.medium, each.medium_reason) for each in graph.flows}
 
 
 def urls(graph: DataLayerGraph) -> dict[str, tuple[str, ...]]:
@@ -324,7 +324,7 @@ REFUSED = {
 def test_a_pair_that_nothing_can_carry_is_one_problem(case: str):
     parties, wishes, text = REFUSED[case]
     (only,) = negotiate(parties, wishes, Terms()).problems
-    assert f"{only.problem}; {only.hint}".removesuffix("; ") == text
+    assert f"{only.why.message}; {only.why.hint}".removesuffix("; ") == text
 
 
 def test_publishers_that_are_told_apart_stay_apart():
@@ -438,7 +438,9 @@ def test_every_pair_gets_a_medium_that_both_ends_support_or_a_problem(system: tu
         if end.kind is EndpointKind.SUBSCRIPTION and end.resolved == each.resolved
     }
     carried = {(each.topic, each.publisher, each.subscription): each for each in graph.flows}
-    refused = {(each.topic, each.publisher, each.subscription) for each in graph.problems}
+    refused = {
+        (each.flow.topic, each.flow.publisher, each.flow.subscription) for each in graph.problems
+    }
     assert {*carried} | refused == pairs
     placed = {
         (each.node, label): transports_of(each.urls)

@@ -49,7 +49,7 @@ def test_who_comes_later_dials_who_came_again_where_it_is_now():
     again = restarted(first, ["talker"], first=first)
     later = restarted(again, ["far"], first=first)
     peers = "&".join(f"peer=127.0.0.1:{port}" for port in (8003, 8005, 10000))
-    assert own(later) == {**own(again), "far": f"{HOST}:10002?{peers}"}
+    assert own(later) == {**own(again), "far": f"{HOST}:10001?{peers}"}
 
 
 def test_of_those_who_come_again_together_one_end_dials_as_planned():
@@ -76,7 +76,7 @@ def test_nobody_ever_has_a_port_again(mode: DiscoveryMode):
 def test_a_client_of_a_discovery_server_needs_to_dial_nobody_else():
     first = system(DiscoveryMode.SERVER)
     again = restarted(first, ["near"], first=first)
-    assert own(again) == {**own(first), "near": f"{HOST}:10001?server=127.0.0.1:8000"}
+    assert own(again) == {**own(first), "near": f"{HOST}:10000?server=127.0.0.1:8000"}
 
 
 def test_what_a_node_of_another_supervisor_says_counts_more_than_the_plan():
@@ -97,8 +97,8 @@ def test_over_udp_everybody_stays_where_it_is():
 
 def test_a_host_without_ports_left_says_so():
     first = system(first_port=63534)
-    with pytest.raises(PlanError, match=r"^cannot give out 3 more ports"):
-        restarted(first, ["talker"], first=first)
+    with pytest.raises(PlanError, match=r"^cannot give out 1 more ports"):
+        restarted(first, ["talker", "near", "far"], first=first)
 
 
 @pytest.mark.parametrize(

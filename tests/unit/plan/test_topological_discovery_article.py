@@ -325,7 +325,7 @@ def test_what_transports_do_you_support_is_answered_and_decides():
     ]
     wish = ("/t", "/p", "/s")
     (problem,) = negotiate(parties, {wish: FlowTransport.UDPV6}, terms_of(plan)).problems
-    assert problem.problem == (
+    assert problem.why.message == (
         "cannot carry '/t' from '/p' to '/s' by udpv6, as a link says so: '/p' can be connected "
         "by shm, tcpv4, udpm, udpv4, udpv6; '/s' by tcpv4"
     )

@@ -179,6 +179,19 @@ def test_a_session_that_cannot_be_extended_any_more_is_made_anew(bench: Bench) -
     assert old not in bench.server.sessions
 
 
+def test_a_session_that_nobody_prolonged_is_made_anew_by_the_next_apply(bench: Bench) -> None:
+    target = bench.make(duration_s=1000)
+    target.apply([rule()])
+    (old,) = bench.server.sessions
+    bench.clock.now += 1000
+    bench.server.expire(old)
+
+    change = only(target.apply([rule()]))
+
+    assert (change.kind.value, change.detail) == ("update", "it has expired")
+    assert bench.session["qosStatus"] == "AVAILABLE"
+
+
 def test_a_token_that_the_server_quotes_in_its_refusal_is_not_repeated(bench: Bench) -> None:
     quoted = f"cannot accept 'Bearer {TOKEN}'"
     refusal = Answer(401, {"status": 401, "code": "UNAUTHENTICATED", "message": quoted})

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.network.dscp import MAX_DSCP
-from lifecycle.programming.host import MAX_COMMENT_BYTES, render_table_removal, table_name
+from lifecycle.programming.host import MAX_COMMENT_BYTES, table_name
 from lifecycle.programming.nft import NftTarget
 from lifecycle.programming.rules import FlowRule
 from tests.unit.programming.flow_samples import (
@@ -45,24 +45,6 @@ def test_nft_knows_how_every_dscp_is_spelled(tmp_path: Path) -> None:
     spelled = {int(value, 0): comment for value, comment in listed}
     assert sorted(spelled) == list(range(MAX_DSCP + 1))
     assert all(f"DSCP {dscp} = " in comment for dscp, comment in spelled.items())
-
-
-def test_applied_twice_there_is_one_table_and_removed_twice_there_is_none(
-    tmp_path: Path,
-) -> None:
-    ours, gone = tmp_path / "ours", tmp_path / "gone"
-    ours.write_text(ruleset(*RULES), encoding="utf-8")
-    gone.write_text(render_table_removal(table_name("teleop")), encoding="utf-8")
-    script = f"""set -e
-nft add table inet someone_else
-nft -f {ours}; nft list ruleset > {tmp_path}/once
-nft -f {ours}; nft list ruleset > {tmp_path}/twice
-nft -f {gone}; nft -f {gone}; nft list ruleset"""
-    done = in_a_network_namespace("sh", "-c", script, needs="nft")
-    assert (done.returncode, done.stderr) == (0, "")
-    once = (tmp_path / "once").read_text(encoding="utf-8")
-    assert once == (tmp_path / "twice").read_text(encoding="utf-8")
-    assert done.stdout.split() == ["table", "inet", "someone_else", "{", "}"]
 
 
 def test_without_rules_the_table_is_there_and_empty() -> None:

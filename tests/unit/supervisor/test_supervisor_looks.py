@@ -182,7 +182,7 @@ async def test_what_clocks_decide_is_judged_once_they_were_compared_after_the_la
         links=[link("/video", "camera", "viewer", quantities=(number,))],
         machines=tuple(Machine(name=each, at=at(2)) for each in ("robot", "desk")),
     )
-    late = Delays(seconds=5.0, buckets=((0, 300),), shift_ns=-450_000_000)
+    late = Delays(seconds=5.0, buckets=((-45_000, 300),), apart=True)
     sample = Sample(seconds=6.0, messages=300, used=late, received=late)
     measured = Measured(active_s=6.0, samples=(("/video", sample),))
     seen = perfect(plan, Stage.ACTIVE)

@@ -58,7 +58,7 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
         assert ros is not None
         said = json.loads(ros.statuses[-1])
         assert (said["phase"], said["verdict"]) == ("verifying", "violated")
-        assert said["not_ok"] == "missing: /camera (node)"
+        assert said["not_ok"] == "/camera (graph.missing-node)"
         assert [each[:3] for each in ros.diagnostics[-1]] == [
             (ERROR, "robot: /camera", "inactive"),
             (WARN, "robot: /viewer", "inactive, the system is verifying"),

@@ -146,7 +146,7 @@ async def test_a_start_that_hangs_is_noticed_and_time_without_a_processor_does_n
 # The gate
 
 
-def waits(most_s: int, what: str = "missing: /viewer (node)") -> str:
+def waits(most_s: int, what: str = "/viewer (graph.missing-node)") -> str:
     """What is said of a gate that is not open after 2 s."""
     return f"[notice] waits up to {most_s} s more for its gate: {what}"
 
@@ -179,7 +179,7 @@ async def test_a_violated_verdict_rolls_everything_back(tmp_path: Path) -> None:
     ]
     assert world.report == (
         "ended when connected, before it was verified, exit code 4: "
-        "the verdict keeps the gate closed; wrong: /intruder (graph.undeclared-node)"
+        "the verdict keeps the gate closed; /intruder (graph.undeclared-node)"
     )
 
 
@@ -207,16 +207,16 @@ async def test_what_cannot_be_verified_is_taken_on_trust_by_name_or_refused_if_s
     world.graph.mute = {"/base"}
     await world.run()
     judged = world.since("[system] connected")[1:]
-    assert judged[0] == "[verdict] connected unverifiable state.unverifiable /base"
+    assert judged[0] == "[verdict] connected unverifiable state.wrong-state /base"
     if strict:
         assert judged[1:] == [
-            waits(28, "unknown: /base (state.unverifiable)"),
+            waits(28, "/base (state.wrong-state)"),
             "[stopping] at 3.5 s: the verdict keeps the gate closed",
             "/base cleanup",
             *CAMERA_DOWN,
             *over(5),
         ]
-        assert "gate closed; unknown: /base (state.unverifiable)" in world.report
+        assert "gate closed; /base (state.wrong-state)" in world.report
     else:
         assert judged[2:6] == [
             "networks programmed (unverifiable)",
@@ -224,7 +224,7 @@ async def test_what_cannot_be_verified_is_taken_on_trust_by_name_or_refused_if_s
             "/camera activate",
             "/base activate",
         ]
-        assert world.report.endswith("done; taken on trust: /base (state.unverifiable)")
+        assert world.report.endswith("done; taken on trust: /base (state.wrong-state)")
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ async def test_networks_that_cannot_be_programmed_keep_the_gate_closed(tmp_path:
 
 def started_again(attempt: int) -> list[str]:
     """What is reported when `viewer` is not discovered by TCP, and what is done."""
-    why = "not discovered over TCP for 5 s (missing: /viewer (node))"
+    why = "not discovered over TCP for 5 s (/viewer (graph.missing-node))"
     return [
         f"[notice] '/viewer' is started again on a fresh port: {why}; try {attempt} of 3",
         *VIEWER_DOWN,
@@ -378,7 +378,7 @@ async def test_a_node_that_would_get_no_other_port_is_waited_for(tmp_path: Path)
     async with world.running("[system] connected"):
         await asyncio.sleep(12.0)
         world.hide()
-    missing = "missing: /camera (node)"
+    missing = "/camera (graph.missing-node)"
     assert world.since("[verdict]")[1:3] == [waits(28, missing), "[verdict] connected ok"]
 
 
@@ -466,7 +466,12 @@ async def test_a_node_that_hangs_is_not_asked_and_is_ended_by_its_watchdog_unles
             "; /camera is still configuring",
             [*VIEWER_DOWN, *KILLED],
         ),
-        ("[verdict]", "when connected, before it was verified", "; missing: /viewer (node)", BACK),
+        (
+            "[verdict]",
+            "when connected, before it was verified",
+            "; /viewer (graph.missing-node)",
+            BACK,
+        ),
         ("networks programmed", "when verified, before it was active", "", BACK),
         (
             "/camera activate",

@@ -14,7 +14,7 @@ from lifecycle.manifest.model import EndpointKind, Machine, Policy, Quantity
 from lifecycle.measure.clock import ClockComparison, ClockOffset
 from lifecycle.measure.counter import Counter
 from lifecycle.measure.flows import CLOCKS_S
-from lifecycle.measure.sample import Delays, Measured, Sample, signed_buckets_of
+from lifecycle.measure.sample import Delays, Measured, Sample, linear_buckets_of
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import apart_from_numbers, verify, with_measured
 from lifecycle.verify.observation import Identity
@@ -26,8 +26,6 @@ from tests.unit.verify.edits import both, change_configuration
 from tests.unit.verify.perfect import perfect
 
 MS = 1_000_000
-SHIFT_NS = -511 * MS
-"""Of delays that seem to be negative: the robot's clock is ahead."""
 
 
 def system(
@@ -52,12 +50,12 @@ def judged(
     delay_ms: float = 1.0,
     seconds: float = 10.0,
     own: str = "station",
-    shift_ns: int | None = SHIFT_NS,
+    apart: bool = True,
     is_up: bool = True,
 ) -> Verdict:
     """Judge as the supervisor of a machine does; delays are those of the robot at +512 ms."""
-    raw_ns = round(delay_ms * MS) - 512 * MS - SHIFT_NS
-    used = Delays(seconds=5.0, buckets=((signed_buckets_of((raw_ns,))[0], 300),), shift_ns=shift_ns)
+    raw_ns = round(delay_ms * MS) - 512 * MS
+    used = Delays(seconds=5.0, buckets=((linear_buckets_of((raw_ns,))[0], 300),), apart=apart)
     sample = Sample(seconds=seconds, messages=300, used=used, received=used)
     return verified(plan, sample, clocks if is_up else None, own)
 
@@ -90,7 +88,7 @@ def test_the_offset_is_subtracted_and_said_with_its_uncertainty() -> None:
     assert flow.clock == robot(0.25)[1]
     assert (flow.p50_ms, flow.p99_ms) == (pytest.approx(1.0), pytest.approx(1.0))
     assert flow.describe() == (
-        "/video /camera → /viewer: delay p99 1 ms ± 0.25 ms ≤ 2 ms, 0.0 Hz, 0 of 0 lost, "
+        "/video /camera → /viewer: delay p99 1 ms ± 0.26 ms ≤ 2 ms, 0.0 Hz, 0 of 0 lost, "
         "clocks 512 ms ± 0.25 ms apart"
     )
 
@@ -98,14 +96,14 @@ def test_the_offset_is_subtracted_and_said_with_its_uncertainty() -> None:
 def test_a_delay_that_is_too_long_whatever_the_clocks_are_is_violated() -> None:
     (found,) = judged(system(), robot(3.1), delay_ms=50).findings
     assert (found.rule, found.outcome) == ("flow.delay", Outcome.VIOLATED)
-    assert found.message.endswith("delay p99 49.8 ms ± 3.86 ms > 2 ms")
+    assert found.message.endswith("delay p99 50 ms ± 3.11 ms > 2 ms")
 
 
 CLOCKS = "the clocks of robot and station"
 WHERE = "max_delay_ms 2 of the flow /camera → /viewer on /video is not measured:"
 
 
-P99 = "delay p99 1.89 ms ± 0.314 ms"
+P99 = "delay p99 1.9 ms ± 0.31 ms"
 
 
 @pytest.mark.parametrize(
@@ -151,10 +149,8 @@ def test_only_the_supervisor_of_the_subscription_judges() -> None:
 
 def test_one_host_has_one_clock_whatever_its_machines_are_called() -> None:
     plan = system(viewer="robot")
-    used = Delays(seconds=5.0, buckets=((signed_buckets_of((MS,))[0], 300),))
-    verdict = judged(plan, own="robot", shift_ns=None)
+    verdict = judged(plan, own="robot", apart=False)
     assert verdict.measured[0].clock is None
-    assert used.quantile_ms(0.99) is not None
     assert verdict.verdict is Outcome.OK
 
 
@@ -170,7 +166,7 @@ def test_messages_of_several_hosts_are_judged_by_all_of_their_clocks() -> None:
 
 
 def test_what_was_counted_as_of_one_host_is_not_compared() -> None:
-    (found,) = judged(system(), robot(0.1), shift_ns=None).findings
+    (found,) = judged(system(), robot(0.1), apart=False).findings
     assert "not compared yet" in found.message
 
 

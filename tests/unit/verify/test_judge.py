@@ -9,24 +9,21 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     EndpointPolicy,
-    Machine,
     Policy,
-    RosInterfaceAccess,
 )
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import with_findings, without_findings
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
-from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
-from tests.builders import at, need, node, planned, publisher, subscription
+from lifecycle.verify.verdict import Stage, ToleratedNode, Verdict
+from tests.builders import need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report, drop_node
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 CLIENT, SERVER = EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER
-STRING = "std_msgs/msg/String"
 
 
 def plan_of(**policy: object) -> Plan:
@@ -39,10 +36,6 @@ def plan_of(**policy: object) -> Plan:
 
 def judged(plan: Plan, *edits: Edit) -> Verdict:
     return verify(plan, both(*edits)(perfect(plan)), stage=Stage.CONNECTED)
-
-
-def has(kind: EndpointKind, node: str, name: str, type_: str = STRING) -> OpenEndpoint:
-    return OpenEndpoint(kind=kind, node=node, name=name, type=type_)
 
 
 def test_a_verdict_without_a_finding_is_as_if_it_had_not_been_made_its_flows_too() -> None:
@@ -77,21 +70,6 @@ def test_what_a_supervisor_finds_itself_comes_first_and_makes_a_verdict_no_bette
         assert added.findings == (*found, *verdict.findings)
 
 
-def test_undeclared_endpoints_of_nodes_that_may_have_such_are_listed_and_no_others() -> None:
-    verdict = judged(
-        plan_of(),
-        add_endpoint(PUB, "/one", "/extra", gid="1"),
-        add_endpoint(CLIENT, "/one", "/ask", type="a/srv/B"),
-        add_endpoint(PUB, "/two", "/other", gid="2"),
-    )
-    assert verdict.open_endpoints == (
-        has(CLIENT, "/one", "/ask", "a/srv/B"),
-        has(PUB, "/one", "/extra"),
-    )
-    assert [each.subject for each in verdict.findings] == ["/other"]
-    assert verdict.tolerated == ()
-
-
 LISTENERS = both(
     add_node("/rviz2"),
     add_endpoint(SUB, "/rviz2", "/a", gid="1", qos=QosProfile()),
@@ -100,17 +78,9 @@ LISTENERS = both(
     add_node("/launch_ros_1"),
 )
 TOOLS = (
-    ToleratedNode(
-        node="/_ros2cli_7",
-        because="tolerated_nodes: _ros2cli_*",
-        endpoints=(has(SUB, "/_ros2cli_7", "/a"),),
-    ),
+    ToleratedNode(node="/_ros2cli_7", because="tolerated_nodes: _ros2cli_*"),
     ToleratedNode(node="/launch_ros_1", because="tolerated_nodes: launch_ros_*"),
-    ToleratedNode(
-        node="/rviz2",
-        because="tolerated_nodes: rviz2",
-        endpoints=(has(SUB, "/rviz2", "/a"), has(CLIENT, "/rviz2", "/ask", "a/srv/B")),
-    ),
+    ToleratedNode(node="/rviz2", because="tolerated_nodes: rviz2"),
 )
 
 
@@ -140,74 +110,12 @@ def rules(plan: Plan, *edits: Edit) -> list[tuple[str, str, str]]:
 
 
 def test_what_a_supervisor_offers_in_ros_is_its_own_and_no_one_elses() -> None:
-    ours, other = "/_lifecycle_observer_1", "/_lifecycle_observer_2"
-    publisher_rule, server_rule = "graph.undeclared-publisher", "graph.undeclared-service-server"
+    server_rule = "graph.undeclared-service-server"
     plan = plan_of()
     verdict = judged(plan, supervisor(1), supervisor(2, "others"))
     assert (verdict.verdict, verdict.tolerated) == (Outcome.OK, ())
-    # Of two that say they are the same, neither is believed; tools and services are not either.
-    both_claim = rules(plan, supervisor(1), supervisor(2))
-    assert {each[1] for each in both_claim} == {ours, other}
-    assert (publisher_rule, other, "/lifecycle/robot/status") in both_claim
-    assert (server_rule, other, "/lifecycle/robot/get_status") in both_claim
-    third = supervisor(3, "others")
-    assert {each[1] for each in rules(plan, supervisor(1), supervisor(2), third)} == {ours, other}
     tool = add_endpoint(SERVER, "/rqt_1", "/lifecycle/robot/pause", type=TRIGGER)
     assert rules(plan, supervisor(1), tool) == [(server_rule, "/rqt_1", "/lifecycle/robot/pause")]
-    pauses = add_endpoint(SERVER, ours, "/lifecycle/robot/pause", type=TRIGGER)
-    assert rules(plan, supervisor(1), pauses) == [(server_rule, ours, "/lifecycle/robot/pause")]
-    full = plan_of(ros_interface=RosInterfaceAccess.FULL)
-    assert rules(full, supervisor(1), pauses) == []
-    off = plan_of(ros_interface=RosInterfaceAccess.OFF)
-    assert {each[2] for each in rules(off, supervisor(1))} == {
-        "/lifecycle/robot/status",
-        "/lifecycle/robot/get_status",
-    }
-
-
-def of_two_machines(**policy: object) -> Plan:
-    return planned(
-        node("one", publisher("a"), machine="near"),
-        node("two", subscription("a"), machine="far"),
-        machines=tuple(Machine(name=each, address="", at=at(2)) for each in ("near", "far")),
-        policy=Policy(**policy),
-    )
-
-
-def serves(number: int, service: str = "get_status", gid: str = "") -> Edit:
-    name = f"/_lifecycle_observer_{number}"
-    return both(
-        add_node(name),
-        add_endpoint(SERVER, name, f"/lifecycle/robot/far/{service}", type=TRIGGER, gid=gid),
-    )
-
-
-def test_a_supervisor_of_another_machine_is_known_by_whatever_is_seen_of_it_first() -> None:
-    """After an outage its services may be seen before its status topic, or the other way round."""
-    plan = of_two_machines()
-    status, *_ = rules(of_two_machines(ros_interface=RosInterfaceAccess.OFF), serves(1))
-    assert status[2] == "/lifecycle/robot/far/get_status"
-    assert rules(plan, serves(1)) == []
-    assert judged(plan, serves(1)).tolerated == ()
-    pauses = serves(1, "pause")
-    assert [each[2] for each in rules(plan, pauses)] == ["/lifecycle/robot/far/pause"]
-    assert rules(of_two_machines(ros_interface=RosInterfaceAccess.FULL), pauses) == []
-
-
-def test_who_only_is_called_as_the_supervisor_of_a_machine_is_not_taken_for_it() -> None:
-    plan = of_two_machines()
-    offered = ["/lifecycle/robot/far/get_status", "/lifecycle/robot/far/status"]
-    # Two say that they are it: of two nodes' names, or two participants of one.
-    for other in (serves(2), serves(1, gid="7" * 25)):
-        both_say = rules(plan, supervisor(1, "robot/far"), other)
-        assert sorted({each[2] for each in both_say}) == offered
-    # Two status topics of one participant agree.
-    again = add_endpoint(
-        *(PUB, "/_lifecycle_observer_1", "/lifecycle/robot/far/status"),
-        gid=f"{ONE_PARTICIPANT[:-1]}19",
-        qos=QosProfile(),
-    )
-    assert rules(plan, supervisor(1, "robot/far"), again) == []
 
 
 def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> None:
@@ -228,10 +136,6 @@ def test_who_reads_diagnostics_has_those_of_supervisors_and_of_nobody_else() -> 
         )
 
     assert found(supervisor(1), publishes("/rqt_robot_monitor", "7" * 25)) == [of_diagnostics]
-    # It is called as a supervisor is; another participant has that one's status.
-    same_name = publishes("/_lifecycle_observer_1", "7" * 25)
-    assert found(supervisor(1), same_name) == [of_diagnostics]
-    assert found(publishes("/_lifecycle_observer_9", "7" * 25)) == [of_diagnostics]
 
 
 @pytest.mark.parametrize(

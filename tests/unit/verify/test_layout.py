@@ -12,7 +12,7 @@ from lifecycle.plan.model import ParticipantConnections, Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation, ObservedEndpoint
 from lifecycle.verify.verdict import Stage
-from lifecycle.verify.view import Actual, View, actual_qos
+from lifecycle.verify.view import Actual, View, Whose, actual_qos
 from tests.builders import node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,
@@ -60,11 +60,9 @@ def nameless_service(name: str, kind: EndpointKind = SERVER, type_: str = TRIGGE
 def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_action() -> None:
     dock = "/robot/dock/_action"
     view = view_after(nameless_service(f"{dock}/send_goal", type_="robot/action/Dock_SendGoal"))
-    assert (view.unattributed, view.undeclared, view.foreign) == ((), (), ())
-    # It is no second one beside that which the node shows, and so has no GID of its own.
-    assert "" in {each.gid for each in view.groups["/robot/camera"] if not each.kind.is_topic}
+    assert view.others == ()
     view = view_after(nameless_service("/other/_action/send_goal"))
-    assert [each.name for each in view.unattributed] == ["/other/_action/send_goal"]
+    assert [each.name for each in view.of(Whose.UNKNOWN)] == ["/other/_action/send_goal"]
 
 
 # --- matching
@@ -81,7 +79,7 @@ def test_a_nameless_report_of_the_declared_type_is_chosen_where_discovery_shows_
     assert actual(view, PUB, "/a").observed == ObservedEndpoint(
         kind=PUB, node="/one", name="/a", type=STRING, qos=right.qos, gid=right.gid, type_hash="h"
     )
-    assert [each.type for each in view.undeclared] == ["std_msgs/msg/Int32"]
+    assert [each.type for each in view.of(Whose.UNDECLARED)] == ["std_msgs/msg/Int32"]
 
 
 # --- what discovery need not show
@@ -141,8 +139,8 @@ def test_the_hash_that_discovery_shows_wins_over_the_reported_one(shown, reporte
         change_endpoint(PUB, STATUS, type_hash=shown),
         change_report(PUB, STATUS, type_hash=reported),
     )
-    (seen,) = (each for each in view_after(edit).seen if (each.kind, each.name) == (PUB, STATUS))
+    (seen,) = view_after(edit).topics[STATUS][0]
     assert seen.type_hash == known
     foreign = add_endpoint(PUB, "/guest", "/x", gid="99", type_hash=shown)
-    (seen,) = (each for each in view_after(foreign).seen if each.node == "/guest")
+    (seen,) = view_after(foreign).of(Whose.FOREIGN)
     assert seen.type_hash == shown

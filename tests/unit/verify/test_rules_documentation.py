@@ -11,7 +11,7 @@ import pytest
 
 import lifecycle
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import RULES, About, Heals, Rule
+from lifecycle.verify.rules import RULES, Heals, Rule
 
 TESTS = Path(__file__).parents[2]
 PAGE = TESTS.parent / "docs" / "rules.md"
@@ -72,9 +72,8 @@ def test_a_rule_cannot_be_given_an_outcome_that_it_does_not_document():
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_what_is_only_not_there_yet_may_come(rule: Rule):
-    passing = rule.absence or rule.awaits or rule.about or rule.if_undiscovered
+    passing = rule.awaits or rule.about or rule.if_undiscovered
     assert not passing or rule.heals is Heals.WITH_TIME
-    assert (rule.about is not About.MATCH) or rule.absence
 
 
 @pytest.mark.parametrize("room", ["supervisor", "verify", "cli"])

@@ -256,51 +256,8 @@ def test_an_end_whose_qos_nobody_knows_may_match_anything():
         assert {each.outcome for each in found} <= {Outcome.UNVERIFIABLE}
     edit = change_endpoint(PUB, "/a", qos=None)
     assert [each[1:] for each in incompatible(edit, plan)] == [
-        ("reliability of at least RELIABLE offered", "reliability UNKNOWN offered")
+        ("reliability RELIABLE", "reliability UNKNOWN")
     ]
-
-
-def several(offers: tuple[QosProfile, ...], requests: tuple[QosProfile, ...]) -> Edit:
-    """Endpoints of two nodes on a topic that no manifest declares."""
-    return both(
-        *(
-            add_endpoint(PUB, "/one", "/x", gid=f"8{index}", qos=each)
-            for index, each in enumerate(offers)
-        ),
-        *(
-            add_endpoint(SUB, "/two", "/x", gid=f"9{index}", qos=each)
-            for index, each in enumerate(requests)
-        ),
-    )
-
-
-def deadline(after_ns: int) -> QosProfile:
-    return QosProfile(deadline_ns=after_ns)
-
-
-@pytest.mark.parametrize(
-    ("offers", "requests", "policies"),
-    [
-        ((BEST_EFFORT, BEST_EFFORT), (QosProfile(),), ["reliability BEST_EFFORT"]),
-        ((BEST_EFFORT,), (QosProfile(), QosProfile()), ["reliability BEST_EFFORT"]),
-        (
-            (replace(BEST_EFFORT, deadline_ns=9),),
-            (deadline(3),),
-            ["reliability BEST_EFFORT", "deadline 9 ns"],
-        ),
-        ((deadline(9), deadline(8)), (deadline(3),), ["deadline 9 ns", "deadline 8 ns"]),
-        ((deadline(9),), (deadline(3), deadline(4)), ["deadline 9 ns", "deadline 9 ns"]),
-    ],
-)
-def test_what_is_equal_of_two_nodes_on_a_topic_is_one_finding(offers, requests, policies):
-    plan = planned(
-        *(
-            node(name, run=ATTACH, managed=False, endpoints=EndpointPolicy.OPEN)
-            for name in ("one", "two")
-        )
-    )
-    found = incompatible(several(offers, requests), plan)
-    assert [each[2] for each in found] == [f"{each} offered" for each in policies]
 
 
 def test_what_is_equal_of_other_topics_or_nodes_is_a_finding_of_its_own():
@@ -313,20 +270,6 @@ def test_what_is_equal_of_other_topics_or_nodes_is_a_finding_of_its_own():
     assert [each[0] for each in incompatible(edit, plan)] == [
         "/a: /one → /two",
         "/a: /three → /two",
-        "/b: /one → /three",
         "/b: /one → /two",
+        "/b: /one → /three",
     ]
-
-
-def test_a_pair_of_strangers_or_of_two_types_does_not_end_the_judgement_of_a_topic():
-    plan = open_world(subscription("a", line=5), subscription("b"))
-    edit = both(
-        add_endpoint(PUB, "/A", "/a", gid="91", qos=BEST_EFFORT, type="std_msgs/msg/Int32"),
-        add_endpoint(PUB, "/B", "/a", gid="92", qos=BEST_EFFORT),
-        add_endpoint(SUB, "/A", "/a", gid="93", qos=QosProfile()),
-        add_endpoint(PUB, "/B", "/b", gid="94", qos=BEST_EFFORT),
-        add_endpoint(SUB, "/one", "/a", gid="96", qos=QosProfile(), type="std_msgs/msg/Bool"),
-        # A topic with subscriptions alone has no pair.
-        add_endpoint(SUB, "/one", "/c", gid="95", qos=QosProfile()),
-    )
-    assert [each[0] for each in incompatible(edit, plan)] == ["/a: /B → /one", "/b: /B → /one"]

@@ -31,8 +31,8 @@ def test_a_node_that_an_earlier_gate_let_through_may_be_on_its_way_and_no_other(
     ahead = frozenset({"/one"})
     assert verify(PLAN, seen, stage=Stage.CONNECTED, ahead=ahead).verdict is Outcome.OK
     (other,) = verify(PLAN, seen, stage=Stage.CONNECTED, ahead=frozenset({"/two"})).findings
-    assert other.message == ("node /one is activating and must be inactive, connected")
+    assert (other.observed, other.expected) == ("activating", "inactive, connected")
     (back,) = verify(
         PLAN, _with_active("/one", "deactivating"), stage=Stage.CONNECTED, ahead=ahead
     ).findings
-    assert back.message == ("node /one is deactivating and must be inactive, connected or active")
+    assert (back.observed, back.expected) == ("deactivating", "inactive, connected or active")

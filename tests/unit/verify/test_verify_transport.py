@@ -12,7 +12,7 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
+from lifecycle.plan.model import Plan
 from lifecycle.verify.network_flows import carrier
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import ConnectionReport
@@ -106,13 +106,6 @@ def test_one_end_without_shared_memory_is_enough_for_the_network(publishing, sub
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
     assert verdict.findings == ()
     assert [each.effective_transport for each in verdict.flows] == ["udpv4"]
-
-
-def test_a_flow_that_needs_no_network_may_go_by_shared_memory():
-    plan = pair(FlowTransport.ANY, FlowTransport.ANY)
-    verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
-    assert verdict.findings == ()
-    assert [each.effective_transport for each in verdict.flows] == ["shm"]
 
 
 @pytest.mark.parametrize(
@@ -281,17 +274,6 @@ def test_what_a_node_lists_wins_over_what_it_was_connected_to(urls, report, used
     assert seen_by(ANY, apart(edit)) == used
 
 
-def test_both_ends_of_a_flow_are_asked_which_process_they_are():
-    edit = both(
-        change_report(PUB, "/a", nfes=(UDP4,)),
-        change_report(SUB, "/a", nfes=(UDP4,)),
-        change_configuration("/one", identity=process(1)),
-    )
-    together = both(edit, change_configuration("/two", identity=process(1)))
-    asunder = both(edit, change_configuration("/two", identity=process(2)))
-    assert (seen_by(ANY, together), seen_by(ANY, asunder)) == ("intraprocess", "udpv4")
-
-
 # --- what findings on transports say
 
 
@@ -321,44 +303,3 @@ def test_a_flow_that_the_network_must_carry_is_found_wrong_once():
         change_report(PUB, "/a", nfes=(UDP4, UDP6)), change_report(SUB, "/a", nfes=(UDP6,))
     )
     assert the_finding(plan, by_udp).rule == "flow.wrong-medium"
-
-
-def undecided() -> Plan:
-    """A plan that only says which medium is expected."""
-    plan = with_medium("shm")
-    return replace(plan, positions={})
-
-
-def with_end(plan: Plan, index: int, **changes: object) -> Plan:
-    """The plan with the one endpoint of a node otherwise."""
-    nodes = list(plan.nodes)
-    (end,) = nodes[index].endpoints
-    nodes[index] = replace(nodes[index], endpoints=(replace(end, **changes),))
-    return replace(plan, nodes=tuple(nodes))
-
-
-def with_node(plan: Plan, index: int, **changes: object) -> Plan:
-    """The plan with one node otherwise."""
-    nodes = list(plan.nodes)
-    nodes[index] = replace(nodes[index], **changes)
-    return replace(plan, nodes=tuple(nodes))
-
-
-NET = PlannedParticipant(name="_net", dscp=None, reason="", connection="net")
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_a_medium_is_held_to_where_either_end_was_told_what_to_use(index):
-    plan = undecided()
-    edit = both(change_report(PUB, "/a", nfes=(UDP4,)), change_report(SUB, "/a", nfes=(UDP4,)))
-
-    def held(plan: Plan) -> bool:
-        verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
-        return "flow.wrong-medium" in {each.rule for each in verdict.findings}
-
-    assert not held(plan)
-    assert not held(with_end(plan, index, transport=NETWORK))
-    assert held(with_end(plan, index, transport=FlowTransport.SHM))
-    assert held(with_node(plan, index, connections=ParticipantConnections(urls=("udpv4://",))))
-    mapped = with_node(with_end(plan, index, participant="_net"), index, participants=(NET,))
-    assert held(mapped)

@@ -119,7 +119,7 @@ def test_what_became_active_on_the_way_back_and_is_wrong_is_named_and_stays_acti
     play.see(INTRUDER)
     play.finish("viewer activate")
     play.wait(40.0)
-    assert "revision 1, but its verdict is violated: wrong: /intruder" in play.answers[0][1]
+    assert "revision 1, but its verdict is violated: /intruder" in play.answers[0][1]
     assert (play.levels, play.phase) == ("4 4", "active")
 
 

@@ -230,8 +230,8 @@ def test_what_changes_behind_an_open_gate_and_heals_in_time_ends_no_bring_up(
 @pytest.mark.parametrize(
     ("found", "wait_s", "why"),
     [
-        (INTRUDER, 1.0, f"; wrong: {STRANGER}"),
-        (GONE, 32.0, f", and {OVER}; missing: /camera (node)"),
+        (INTRUDER, 1.0, f"; {STRANGER}"),
+        (GONE, 32.0, f", and {OVER}; /camera (graph.missing-node)"),
     ],
 )
 def test_what_stays_wrong_behind_an_open_gate_ends_the_bring_up_and_is_named(
@@ -250,7 +250,7 @@ def test_what_became_active_is_judged_again_and_must_be_what_was_verified() -> N
     play.see(INTRUDER)
     play.finish("viewer activate")
     play.wait(1.0)
-    why = f"what became active is not what was verified; wrong: {STRANGER}"
+    why = f"what became active is not what was verified; {STRANGER}"
     assert (play.code, play.reason) == (4, why)
 
 
@@ -262,7 +262,7 @@ def test_who_comes_again_and_is_not_what_was_verified_once_it_is_active_has_fail
     play.see(INTRUDER)
     play.finish("camera activate")
     play.wait(1.0)
-    text = "cannot keep '/camera' active: what became active is not what was verified; wrong: {}"
+    text = "cannot keep '/camera' active: what became active is not what was verified; {}"
     assert play.failures[-1] == ("/camera", text.format(STRANGER))
     assert [each.restarts for each in play.heard(RestartScheduled)] == [0, 1]
 
@@ -353,7 +353,7 @@ def _hold(play: Play) -> None:
         (_pause, 0, ""),
         (_restart, 143, "; the system was restarting, not active"),
         (_restart_and_see, 143, f"; the system was restarting, not active; {PASSED}"),
-        (_violate, 0, f"; violated meanwhile, wrong: {STRANGER}"),
+        (_violate, 0, f"; violated meanwhile, {STRANGER}"),
         (_hold, 4, f"; held at the gate, and not active; {PASSED}"),
     ],
 )

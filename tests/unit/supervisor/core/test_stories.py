@@ -203,9 +203,9 @@ def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
 @pytest.mark.parametrize(
     ("lasts_s", "code", "why"),
     [
-        (2.0, 4, "done, but violated meanwhile, wrong"),
-        (0.2, 0, "done; violated for no longer than 1 s, and not counted"),
-        (20.0, 4, "done, but violated; wrong"),
+        (2.0, 4, "done, but violated meanwhile,"),
+        (0.2, 0, "done; violated for no longer than 1 s, and not counted:"),
+        (20.0, 4, "done, but violated;"),
     ],
 )
 def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, why: str) -> None:
@@ -214,7 +214,7 @@ def test_a_violation_that_lasted_is_in_the_exit_code(lasts_s: float, code: int, 
     play.wait(lasts_s)
     play.see()
     play.wait(10.0)
-    assert (play.code, play.reason) == (code, f"{why}: /intruder (graph.undeclared-node)")
+    assert (play.code, play.reason) == (code, f"{why} /intruder (graph.undeclared-node)")
 
 
 def test_who_needs_a_node_that_is_kept_inactive_is_kept_inactive_too() -> None:
