@@ -301,7 +301,7 @@ def test_what_changes_while_a_system_is_resumed_has_it_paused_again() -> None:
 def test_a_restart_for_which_no_port_is_left_ends_the_run() -> None:
     play = Play(replace(DIALLING, discovery=Discovery(first_port=65535)))
     play.order(ControlRequest.RESTART, node="viewer")
-    full = "cannot give out 2 more ports: they would begin at 67535, and the highest is 65535"
+    full = "cannot give out 1 more ports: they would begin at 67535, and the highest is 65535"
     assert play.answers[0] == (6, full)
     assert (play.code, play.reason) == (6, "failed: robot (run.start-failed)")
 
