@@ -270,7 +270,7 @@ def _sentence(event: events.Event) -> str | None:  # noqa: PLR0911, PLR0912 - on
                 f"restarted {count(event.restarts, 'time')}"
             )
         case events.GaveUp():
-            return f"gave up {event.process} after {count(len(event.history), 'failure')}"
+            return f"gave up {event.process} after {count(event.restarts + 1, 'failure')}"
         case events.ConsequenceTaken():
             whom = f" {', '.join(event.nodes)}" if event.nodes else ""
             return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"

@@ -635,7 +635,7 @@ class Soaking:
         events = run.events[since:]
         for number, event in enumerate(events):
             kind = event.get("event")
-            if kind == "silent" and event["cause"] != "unserved":
+            if kind == "silent":
                 who = event["node"]
                 if event["cause"] == "hung" and _came_back(who, events[number:]):
                     # A thread that holds a lock of its process, or of Fast DDS, got no processor.

@@ -47,10 +47,6 @@ def export(plan: Plan, flows: Sequence[FlowReport], program: Program) -> None:
     _show_left_out(programmer.left_out)
 
 
-_EMPTY_GRAPH_S = 1.5
-"""Some node of what runs is seen within so long; a system without any is waited for if asked."""
-
-
 _timeout = common.timeout_option(5.0, "How long flows that are not complete may still become so.")
 
 
@@ -135,12 +131,7 @@ def _show(
     if record is not None or watch:
         common.say(over)
         return ExitCode.OK
-    asked = click.get_current_context().get_parameter_source("timeout")
-    waits = asked is not click.core.ParameterSource.DEFAULT or looking.supervisor_of(
-        os.environ, plan, ""
-    )
-    empty_graph_s = None if waits else _EMPTY_GRAPH_S
-    seen = looking.judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
+    seen = looking.judge_running(plan, timeout_s=timeout, strict=False)
     seen = looking.with_supervisors_numbers(seen)
     for each in seen.notices:
         common.say(each)

@@ -16,12 +16,14 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, one_line, sentence
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.run.journal import RecordedRun
+    from lifecycle.supervisor.run.journal import Moment
     from lifecycle.verify.verdict import Finding
 
 
-def _recorded(run: str | None, system: str) -> RecordedRun:
-    """Read the journal that is meant; what of it cannot be read is said on stderr.
+def _recorded(run: str | None, system: str) -> tuple[list[Moment], int]:
+    """Read the journal that is meant, and of which supervisor it is.
+
+    What of it cannot be read is said on stderr.
 
     Raises:
         UsageError: there is none.
@@ -43,12 +45,11 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
         path = Path(run)
         if not os.path.exists(path) and os.path.exists(ros_log_root(os.environ) / run):
             path = ros_log_root(os.environ) / run
-    recorded = read_run(journal_files(path))
-    for place, why in recorded.unreadable:
-        say(f"passed over {place}: {why}")
-    if recorded.run is None:
+    moments = read_run(journal_files(path), lambda text: say(f"passed over {text}"))
+    runs = [each.line.run for each in moments if each.line.run is not None]
+    if not runs:
         raise UsageError(f"cannot read {str(path)!r} as a journal: no line says of which run")
-    return recorded
+    return moments, runs[0].supervisor
 
 
 @click.command("history")
@@ -62,23 +63,23 @@ def command(*, run: str | None, system: str, format_: str) -> int:
     that it has and the one before had not (+), and those that are gone (-). JSON has the lines of
     the journal.
     """
-    recorded = _recorded(run, system)
+    moments, supervisor = _recorded(run, system)
     if format_ == "json":
-        for moment in recorded.moments:
+        for moment in moments:
             echo_while_read(json_text(moment.text))
         return ExitCode.OK
-    for each in _timeline(recorded):
+    for each in _timeline(moments, supervisor):
         echo_while_read(each)
     return ExitCode.OK
 
 
-def _timeline(recorded: RecordedRun) -> Iterator[str]:
+def _timeline(moments: list[Moment], supervisor: int) -> Iterator[str]:
     from lifecycle.cli.up_output import Narrator
     from lifecycle.supervisor.run.events import Stopped, VerdictChanged
 
     over, narrator = False, Narrator()
     found: tuple[Finding, ...] = ()
-    for each in recorded.moments:
+    for each in moments:
         over = isinstance(each.event, Stopped) or (over and each.line.run is None)
         clock = dt.datetime.fromtimestamp(each.line.at).astimezone().strftime("%H:%M:%S.%f")[:-3]
         at = f"{clock} {each.line.elapsed_s:+10.3f}"
@@ -93,7 +94,5 @@ def _timeline(recorded: RecordedRun) -> Iterator[str]:
                     yield sentence(f"    + {one.outcome.value} {one.rule}: {one.message}")
             for outcome, rule, subject in sorted(known - now, key=lambda gone: gone[1:]):
                 yield one_line(f"    - {outcome.value} {rule}: {subject}")
-    if not over and recorded.moments:
-        pid = recorded.run.supervisor if recorded.run else 0
-        if not Path(f"/proc/{pid}").exists():
-            yield f"the journal ends here: supervisor {pid} ended without saying so"
+    if not over and not Path(f"/proc/{supervisor}").exists():
+        yield f"the journal ends here: supervisor {supervisor} ended without saying so"

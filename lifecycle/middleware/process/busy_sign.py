@@ -17,7 +17,6 @@ interpreter's lock is seen as well.
 from __future__ import annotations
 
 import contextlib
-import enum
 import faulthandler
 import mmap
 import os
@@ -39,15 +38,6 @@ _NS = 1_000_000_000
 
 _SLOW_PARTS = 4
 """Whoever has run for this part of the limit beyond it is slow by itself."""
-_UNSERVED_LIMITS = 5
-"""So many times the limit without a processor is a fault of its own."""
-
-
-class Overdue(enum.Enum):
-    """Why a thread is busy beyond its limit."""
-
-    HANGS = "hangs"  # in what it does
-    UNSERVED = "unserved"  # it is ready to run, and the machine has no processor for it
 
 
 class _Turns(typing.NamedTuple):
@@ -68,7 +58,7 @@ class BusySign:
         self._page = page
         self._memory = mmap.mmap(page, _PAGE_BYTES)
         self._words = memoryview(self._memory).cast("q")
-        self._looked_at: tuple[int, Overdue | None] = (0, None)
+        self._looked_at = (0, False)
         self._last: _Turns | None = None  # at the last look
         self._before: _Turns | None = None  # at the last look before it became busy
         self._overdue: _Turns | None = None  # at the first look beyond the limit
@@ -135,31 +125,27 @@ class BusySign:
 
     # The watcher's side.
 
-    def look(self) -> tuple[Overdue | None, float]:
-        """Return why the holder is busy beyond its limit, if it is, and when to look again.
+    def look(self) -> tuple[bool, float]:
+        """Return whether the holder hangs: it is busy beyond its limit; and when to look again.
 
-        Each reason is returned once for what the holder does; the other is seconds, > 0.
+        That is said once for what the holder does; the other is seconds, > 0.
         """
         # The time first: what the holder measures itself is then never less.
         now = time.monotonic_ns()
         since, limit = self._words[_SINCE], self._words[_LIMIT]
         turns = _turns_of(self._words[_THREAD], now)
         if since != self._looked_at[0]:
-            self._looked_at = (since, None)
+            self._looked_at = (since, False)
             self._before, self._overdue = self._last, None
         self._last = turns
         left = since + limit - now if since else limit
         if left > 0:
-            return None, min(left, limit) / _NS
-        why, said = None, self._looked_at[1]
-        own = self._own_ns(since, now, turns)
-        if own >= limit:
-            why = Overdue.HANGS
-        elif now - since >= _UNSERVED_LIMITS * limit:
-            why = Overdue.UNSERVED
-        self._looked_at = (since, why or said)
+            return False, min(left, limit) / _NS
+        said, own = self._looked_at[1], self._own_ns(since, now, turns)
+        self._looked_at = (since, said or own >= limit)
         part = limit // _SLOW_PARTS
-        return why if why is not said else None, (limit - own if part < own < limit else part) / _NS
+        left = limit - own if part < own < limit else part
+        return own >= limit and not said, left / _NS
 
     def _own_ns(self, since: int, now: int, turns: _Turns | None) -> int:
         """Return for how much of the time since then it ran, or waited for something else."""
@@ -175,12 +161,6 @@ class BusySign:
         if before is None or before.thread != turns.thread:
             before = self._before = turns
         return now - max(since, before.at_ns) - (turns.waited_ns - before.waited_ns)
-
-    @property
-    def busy_s(self) -> float:
-        """Seconds that the holder has been busy; 0 if it is not."""
-        since = self._words[_SINCE]
-        return max(0.0, (time.monotonic_ns() - since) / _NS) if since else 0.0
 
     @property
     def what(self) -> str:

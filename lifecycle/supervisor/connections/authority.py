@@ -44,20 +44,11 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.system import NodeRun
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
-AGAIN_S = 0.1
-"""What was lost is made again at once; the next try comes so long after, then twice as long ..."""
-
-AGAIN_AT_MOST_S = 5.0
-"""... up to this, ..."""
-
-TRIES = 8
-"""... and after so many it is given up until the node's configuration changes."""
+AGAIN_S = 1.0
+"""What was lost is made again at once; the next try comes so long after."""
 
 RELEASE_S = 2.0
 """For disconnecting a node that is not declared: it is not waited for longer at the end."""
-
-CALM_S = 10.0
-"""A node that stayed wired for so long has its tries back."""
 
 
 class _Wiring(msgspec.Struct):
@@ -66,17 +57,15 @@ class _Wiring(msgspec.Struct):
     Attributes:
         has: what the node had at last.
         ours: names of what it was connected to by us, oldest first.
-        rounds: tries to make what is missing; `last_s`: when the last one was.
-        error: why the last one failed; empty if it did not.
-        given_up: checksum of the configuration with which the tries were used up.
+        tries: to make what is missing; `last_s`: when the last one was.
+        error: why it cannot be made; empty if nothing is missing, or it was not tried yet.
     """
 
     has: Instructions
     ours: list[str] = msgspec.field(default_factory=list)
-    rounds: int = 0
+    tries: int = 0
     last_s: float = float("-inf")
     error: str = ""
-    given_up: str | None = None
 
 
 class ConnectionAuthority:
@@ -183,9 +172,7 @@ class ConnectionAuthority:
     def findings(self) -> tuple[Finding, ...]:
         """Return what could not be wired while the system runs."""
         found = [
-            not_wired(name, wiring.error)
-            for name, wiring in self._wirings.items()
-            if wiring.error and wiring.given_up is not None
+            not_wired(name, wiring.error) for name, wiring in self._wirings.items() if wiring.error
         ]
         system = self._system.plan.system
         found += [not_wired(system, each) for each in self._problems()]
@@ -200,8 +187,7 @@ class ConnectionAuthority:
         if not self._follows:
             return False
         return any(not each.done() for each in self._making.values()) or any(
-            missing and self._wiring(said.name).given_up != said.checksum
-            for said, _, missing in self._lacking()
+            missing and not self._wiring(said.name).error for said, _, missing in self._lacking()
         )
 
     def _wiring(self, name: str) -> _Wiring:
@@ -250,27 +236,18 @@ class ConnectionAuthority:
         if making is not None and not making.done():
             return False
         if not missing:
-            wiring.has, wiring.error = has, ""
+            wiring.has, wiring.error, wiring.tries = has, "", 0
             return False
-        now_s = self._shell.now_s()
-        if wiring.given_up == said.checksum:
-            return False
-        if wiring.given_up is not None or now_s - wiring.last_s > CALM_S:
-            wiring.rounds, wiring.given_up = 0, None
-        elif wiring.rounds >= TRIES:
-            wiring.given_up = said.checksum
-            return False
-        pause_s = min(AGAIN_AT_MOST_S, AGAIN_S * 2 ** (wiring.rounds - 1))
-        due_s = wiring.last_s + (pause_s if wiring.rounds else 0.0)
-        if now_s < due_s:
-            self.again_s = min(self.again_s, due_s - now_s)
-        return now_s >= due_s
+        left_s = wiring.last_s + AGAIN_S - self._shell.now_s()
+        if left_s > 0:
+            self.again_s = min(self.again_s, left_s)
+        return left_s <= 0
 
     async def _repair(self, name: str, has: Instructions, missing: tuple[Command, ...]) -> None:
         wiring = self._wiring(name)
         self._say_lost(wiring, has)
-        wiring.rounds += 1
-        wiring.last_s, wiring.has, wiring.error = self._shell.now_s(), has, ""
+        wiring.tries += 1
+        wiring.last_s, wiring.has = self._shell.now_s(), has
         try:
             await self._make(name, missing)
         except BringUpError as error:
@@ -297,7 +274,7 @@ class ConnectionAuthority:
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
-                self._system.emit(_done(step, attempt=wiring.rounds, error=error.message))
+                self._system.emit(_done(step, attempt=wiring.tries, error=error.message))
                 raise
             finally:
                 if node is not None:
@@ -312,14 +289,8 @@ class ConnectionAuthority:
                     self._others[configuration.name] = configuration
                 else:
                     node.learn(configuration)
-            self._system.emit(_done(step, attempt=wiring.rounds))
+            self._system.emit(_done(step, attempt=wiring.tries))
         self._system.touch()
-
-
-def _may_be_wired(node: NodeRun) -> bool:
-    """Whether a node can be asked; one that was found active is verified as it was found."""
-    asked = node.driver is not None and not (node.is_gone or node.core.stuck)
-    return asked and node.core.base is not Level.ACTIVE
 
 
 def _done(step: Command, *, attempt: int = 1, error: str = "") -> WiringChanged:

@@ -7,10 +7,7 @@ supervisor, so nothing here imports plans, rules or asyncio.
 
 from __future__ import annotations
 
-import contextlib
 import enum
-import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,14 +21,11 @@ from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.measure.flows import FlowMeasurement
 from lifecycle.run_directory import (
     RunDirectory,
-    boot_id,
     connect,
     is_held,
     lost,
     new_run_id,
-    read_record,
     silent,
-    start_ticks,
 )
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 
@@ -421,7 +415,6 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     """
     _check_answers(path)
     deadline = time.monotonic() + timeout_s
-    patience = time.monotonic() + _STARTS_S
     question, left_s = Question(ask=ControlRequest.DOWN), timeout_s
     answer: Answer | None = None
     while True:
@@ -433,9 +426,6 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         # It is just starting, and will listen; or ending, and does so no more; or has answered.
         if time.monotonic() > deadline:
             raise TimeoutError
-        if answer is None and time.monotonic() > patience:
-            _terminate(path)
-            patience = deadline
         time.sleep(_AGAIN_S)
         left_s = max(_AGAIN_S, deadline - time.monotonic())
     if answer is not None:
@@ -455,25 +445,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     return ExitCode.OK
 
 
-def _terminate(path: Path) -> None:
-    """Have a supervisor end that does not listen (yet), as by SIGTERM: it may wait for long."""
-    record = read_record(path)
-    if record is None or record.boot_id != boot_id():
-        return
-    of = record.supervisor
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        pidfd = os.pidfd_open(of.pid)
-        try:
-            if start_ticks(of.pid) == of.start_ticks:
-                signal.pidfd_send_signal(pidfd, signal.SIGTERM)
-        finally:
-            os.close(pidfd)
-
-
 _FOLLOWED_S = 0.5
 
 _AGAIN_S = 0.02
 """Neither a lock nor a socket that is yet to be made can be waited for with a deadline."""
-
-_STARTS_S = 2.0
-"""A supervisor listens sooner, unless it waits for a network interface or a discovery server."""

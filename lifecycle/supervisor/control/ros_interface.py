@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -18,7 +17,7 @@ import msgspec
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.graph.loop import set_within
-from lifecycle.manifest.model import Policy, RosInterfaceAccess
+from lifecycle.manifest.model import RosInterfaceAccess
 from lifecycle.manifest.names import supervisor_prefix, supervisor_services
 from lifecycle.measure.flows import FlowMeasurement, Pair
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus, timeless
@@ -46,23 +45,6 @@ BRINGS_UP_S = 3.5
 AFTER_ACTIVE_S = 0.25
 """What was to do for `active` is done first; who ends the system then pays nothing for this."""
 _BURST_S = 0.05
-_PACKAGES = ("diagnostic_msgs", "std_msgs", "std_srvs")
-
-
-def check_installed(policy: Policy) -> None:
-    """Make sure that what a manifest asks for can be offered.
-
-    Raises:
-        MiddlewareError: a package is not installed.
-    """
-    if policy.ros_interface in (None, RosInterfaceAccess.OFF):
-        return
-    if lacking := [name for name in _PACKAGES if find_spec(name) is None]:
-        raise MiddlewareError(
-            f"cannot offer 'policy: {{ros_interface: {policy.access.value}}}': no Python "
-            f"package {' or '.join(lacking)} is installed",
-            hint="install it, or write 'policy: {ros_interface: off}'",
-        )
 
 
 Answer = Callable[[bool, str], None]

@@ -60,7 +60,7 @@ def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
     ]
     matches = _matches(node, configuration, flows)
     external = node.planned.run.kind is RunKind.ATTACH
-    last = None if known is None or not known.failures else known.failures[-1]
+    last = None if known is None else known.failure
     if last is not None:
         ago = dt.timedelta(seconds=elapsed_s - last.elapsed_s)
         at = dt.datetime.now(dt.timezone.utc) - ago
@@ -137,7 +137,7 @@ def _died(run: Run, process: Process | None, pid: int) -> str:
     """Say how a node's process ended without being asked to; empty if it has not."""
     if process is None or process.end is None or process.escalation is not None or process.is_over:
         return ""
-    if run.ending is not None and not process.failures and not run.deaths:
+    if run.ending is not None and process.failure is None and not run.deaths:
         return ""
     return f"pid {pid} died: {process.end.text}"
 

@@ -14,6 +14,7 @@ from lifecycle.manifest.model import TargetState
 from lifecycle.plan.comparison import PlanChange, change_between, difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
+from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
     Change,
@@ -33,6 +34,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
 )
 from lifecycle.supervisor.run.options import Until
+from lifecycle.verify.judge import not_ok
 
 # Modes
 
@@ -191,18 +193,17 @@ def _is_down(run: Run, change: Change) -> bool:
 
 
 def _take(run: Run, change: Change) -> None:
-    """Exchange the plan; what stays is connected as it is."""
-    plan, before = (change.before, change.plan) if change.back else (change.plan, change.before)
+    """Exchange the plan."""
+    plan = change.before if change.back else change.plan
     if change.back:
         run.mode, run.revision = change.mode, change.revision
     else:
         run.mode = run.mode_by(plan)
         run.revisions += 1
         run.revision = run.revisions
-    stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
     run.first = plan
     gone = {key: run.nodes.pop(key) for key in change.down & run.nodes.keys()}
-    install(run, _connected_as(in_mode(plan, run.mode), stays, before))
+    install(run, in_mode(plan, run.mode))
     for key in gone.keys() & run.nodes.keys():  # who was kept inactive waits for a person still
         run.nodes[key].withheld, run.nodes[key].refused = gone[key].withheld, gone[key].refused
     for key in change.touched & run.nodes.keys():
@@ -213,21 +214,6 @@ def _take(run: Run, change: Change) -> None:
     run.changed()
     until = Until.VERIFIED if run.paused else Until.ACTIVE
     run.passage = Passage(until_s=change.until_s, until=until)
-
-
-def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:
-    """Return a plan with the connections that running nodes have: a restart may have moved them."""
-    were = {each.key: each for each in before.nodes}
-
-    def connected(node: PlannedNode) -> PlannedNode:
-        was, now = were.get(node.key), stays.get(node.key)
-        if was is None or now is None:
-            return node
-        if (was.connections, was.participants) != (node.connections, node.participants):
-            return node
-        return replace(node, connections=now.connections, participants=now.participants)
-
-    return replace(plan, nodes=tuple(map(connected, plan.nodes)))
 
 
 def _finish(run: Run, change: Change) -> list[Event]:
@@ -254,9 +240,10 @@ def undone(run: Run, change: Change) -> str:
     how = f"{now} and verified"
     if change.again:
         how = f"and what failed meanwhile is started again as its policy says: {change.again}"
-    elif change.state:
+    elif (verdict := run.judged.verdict) is not None and not gate.allows(run):
         resume = "" if now == "active" else ": lifecycle resume"
-        how = f"but {change.state}; it is {now}{resume}"
+        found = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
+        how = f"but {found}; it is {now}{resume}"
     elif now == "held":
         how = "verified, and held as before: lifecycle resume"
     return f"{text}{before} is in force again, revision {run.revision}, {how}"

@@ -47,9 +47,6 @@ from lifecycle.verify.verdict import Verdict
 ALSO_S = 0.5
 """For steps in progress to fail, too, once one has failed: one run names all causes."""
 
-_REMEMBERED = 20
-"""Failures of one process; a limit on what a report repeats, not on what is counted."""
-
 _ING = {
     Step.START: "starting",
     Step.CONFIGURE: "configuring",
@@ -280,13 +277,12 @@ def _cut_short(run: Run, failure: Failure) -> None:
 
 def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) -> list[Event]:
     """Have a process, and what goes down with it, started again later; or give it up."""
-    process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
+    process.failure = remembered = _remembered(run, failure, end)
     was_up = run.held_s is not None
     due_s = again_at_s(process, run.now_s, was_up=was_up)
     events: list[Event] = [goes_on(failure)]
     if due_s is None:
-        history = tuple(process.failures)
-        events.append(GaveUp(process=process.name, restarts=process.restarts, history=history))
+        events.append(GaveUp(process=process.name, restarts=process.restarts))
         run.fails_now(_given_up(process, failure, was_up=was_up))
         return events
     keys = run.group(process.name)
@@ -302,7 +298,7 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
             process=process.name,
             nodes=tuple(run.nodes[key].name for key in keys),
             reason=failure.message,
-            stderr=process.failures[-1].stderr,
+            stderr=remembered.stderr,
             restarts=process.restarts,
             in_s=due_s - run.now_s,
         )
@@ -362,13 +358,11 @@ def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
 def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
     how = process.how
     burst = how.start_limit_burst
-    lines = "; ".join(
-        f"at {each.elapsed_s:.1f} s, {each.message}" for each in process.failures[-burst:]
-    )
     within = f"within {how.start_limit_interval_sec:g} s" if was_up else "during bring-up"
     text = (
         f"cannot keep {process.name!r} running: it was started {burst} time{'s' * (burst != 1)} "
-        f"{within} (start_limit_burst, start_limit_interval_sec) and failed again: {lines}"
+        f"{within} (start_limit_burst, start_limit_interval_sec) and failed again: "
+        f"{failure.message}"
     )
     return replace(failure, rule=GAVE_UP.id, message=text, process=process.name)
 

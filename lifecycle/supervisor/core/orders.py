@@ -42,9 +42,6 @@ FITS = {
 }
 """In which phases an order can begin, and what is said in any other."""
 
-STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
-"""Orders that start processes."""
-
 
 def refusal(run: Run, order: Order) -> str:
     """Return why an order cannot be carried out now; empty if it can."""
@@ -296,7 +293,8 @@ def _asked(run: Run, finding: Finding) -> tuple[Consequence, Finding, tuple[str,
         return what, finding, (), reaction.mode
     if what is Consequence.DEACTIVATE:
         gated = [each for each in own if each.is_gated]
-        keys = tuple(each.key for each in gated if each.level is Level.ACTIVE)
+        active = (each for each in gated if each.level is Level.ACTIVE and not each.withheld)
+        keys = tuple(each.key for each in active)
         if gated:
             return (what, finding, keys, "") if keys else None
         what = Consequence.PAUSE

@@ -66,7 +66,9 @@ def _wait_again(run: Run) -> None:
     if run.asked is not None:
         return
     busy = run.switch is not None or run.change is not None or run.held_s is None
-    if busy or not advance.waiting(run) or not advance.is_at_gate(run):
+    # A plain node waits for no gate: what it brought along is verified, and programmed, too.
+    back = any(each.away_s is not None and not each.failed for each in run.processes.values())
+    if busy or not (advance.waiting(run) or back) or not advance.is_at_gate(run):
         run.passage = None
     elif run.passage is None:
         run.passage = Passage(until_s=run.now_s + run.timeout_s, asked=False, mark=0)
@@ -217,9 +219,7 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
     for key in (*keys, *sent):
         # With what is started again by its policy these pass, too.
         run.nodes[key].refused = change is None or not change.again
-    if change is not None:
-        change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
-    else:
+    if change is None:
         run.answer(code, text)
     return said
 
@@ -230,7 +230,6 @@ def _became_another(run: Run) -> list[Event]:
     assert passage is not None
     if run.change is not None:
         run.passage = None
-        run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
         return [Notice(message=gate.refusal(verdict))]
     if passage.asked:
         run.answer(gate.exit_code(verdict), gate.refusal(verdict))

@@ -420,8 +420,10 @@ def _returned(run: Run) -> list[Event]:
         return []
     for process in run.processes.values():
         members = [*run.nodes_of(process.name)]
+        # A plain one is verified with what waits for the gate, see passing.py.
+        verified = any(each.is_gated for each in members) or run.passage is run.asked
         if process.away_s is not None and all(
-            Level.DOWN < advance.wanted(run, each) <= each.level for each in members
+            verified and Level.DOWN < advance.wanted(run, each) <= each.level for each in members
         ):
             events.append(
                 Restarted(

@@ -254,6 +254,7 @@ class Process(msgspec.Struct, kw_only=True):
         restarts: how often it was started again after a failure.
         starts: when it was started, by all that its start limit counts.
         in_a_row: its failures without a long run between them.
+        failure: its last one.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
         escalation: what is left of the steps to end it; None before it is asked to end.
@@ -273,7 +274,7 @@ class Process(msgspec.Struct, kw_only=True):
     restarts: int = 0
     starts: list[float] = []
     in_a_row: int = 0
-    failures: list[Failed] = []
+    failure: Failed | None = None
     failed: bool = False
     away_s: float | None = None
     escalation: Escalation | None = None
@@ -389,7 +390,6 @@ class Change(msgspec.Struct, kw_only=True):
         given: what nodes were asked to take; who did not answer may have taken it.
         taken: the manifest is in force.
         back: the system goes back to the manifest before.
-        state: why the gate stayed closed for the manifest before; empty if it did not.
         again: what failed meanwhile, and is started again by its policy; empty if nothing.
     """
 
@@ -408,7 +408,6 @@ class Change(msgspec.Struct, kw_only=True):
     back: bool = False
     reason: str = ""
     code: ExitCode = ExitCode.OK
-    state: str = ""
     again: str = ""
 
 

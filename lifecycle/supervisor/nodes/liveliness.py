@@ -16,12 +16,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import ended
 from lifecycle.manifest.model import RunKind
-from lifecycle.middleware.process.busy_sign import Overdue
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -35,7 +33,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import NOT_ANSWERING, SILENT_NODE
 from lifecycle.verify.tool_filter import is_hidden_node, tolerating_pattern
-from lifecycle.verify.verdict import Finding, Verdict
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
@@ -48,7 +46,6 @@ class Cause(enum.Enum):
 
     STOPPED = "stopped"
     HUNG = "hung"
-    UNSERVED = "unserved"
     LOST = "lost"
     REPORTED = "told"
 
@@ -56,7 +53,6 @@ class Cause(enum.Enum):
 class _Silence(msgspec.Struct):
     since_s: float
     causes: dict[Cause, str]
-    hangs_since_s: float = 0.0
 
 
 class SilenceMonitor:
@@ -92,11 +88,10 @@ class SilenceMonitor:
         silence = self._silent.get(node)
         return silence is not None and bool({Cause.STOPPED, Cause.LOST} & silence.causes.keys())
 
-    def note(self, nodes: Iterable[str], cause: Cause, why: str, *, busy_s: float = 0.0) -> None:
+    def note(self, nodes: Iterable[str], cause: Cause, why: str) -> None:
         """Note why nodes are silent, half a sentence; empty once that cause of it is gone.
 
-        A node without another cause is alive then. A callback of theirs has been running for
-        `busy_s` if they hang.
+        A node without another cause is alive then.
         """
         now_s, is_news = self._emit.elapsed_s, False
         for name in nodes:
@@ -109,8 +104,6 @@ class SilenceMonitor:
                 self._emit(NodeSilent(node=name, cause=cause.value, message=_message(name, why)))
             if why:
                 silence.causes[cause] = why
-                if cause is Cause.HUNG:
-                    silence.hangs_since_s = now_s - busy_s
                 continue
             del silence.causes[cause]
             if not silence.causes:
@@ -144,13 +137,11 @@ class SilenceMonitor:
             self._silent.pop(name, None)
             self._unanswering.pop(name, None)
 
-    def watch_over(
-        self, process: ManagedProcess, nodes: Iterable[str]
-    ) -> Callable[[Overdue | None], None]:
+    def watch_over(self, process: ManagedProcess, nodes: Iterable[str]) -> Callable[[bool], None]:
         """Follow a process that is about to be spawned.
 
         Returns:
-            What its control channel calls when its executor is busy for too long, or came back.
+            What its control channel calls when its executor hangs, or came back.
         """
         names = tuple(nodes)
 
@@ -158,27 +149,19 @@ class SilenceMonitor:
             why = f"its process {process.name!r} (pid {process.pid}) was stopped by a signal"
             self.note(names, Cause.STOPPED, why if is_stopped else "")
 
-        def hung(why: Overdue | None) -> None:
-            where = f"its process {process.name!r} (pid {process.pid})"
-            hangs = unserved = ""
-            busy_s = 0.0
-            if why is Overdue.HANGS:
+        def hung(is_hung: bool) -> None:
+            hangs = ""
+            if is_hung:
                 assert process.channel is not None
                 assert process.channel.sign is not None
                 sign = process.channel.sign
-                limit_s, busy_s = sign.limit_s, sign.busy_s
                 what = f" {sign.what}" if sign.what else ""
                 at = process.where()
                 hangs = (
-                    f"a callback{what} in {where} has been running for more than {limit_s:g} s"
-                    f"{at and f', in {at}'}"
+                    f"a callback{what} in its process {process.name!r} (pid {process.pid}) has "
+                    f"been running for more than {sign.limit_s:g} s{at and f', in {at}'}"
                 )
-            elif why is Overdue.UNSERVED:
-                unserved = f"{where} gets no processor for its callback: the machine is overloaded"
-            if unserved:  # they are silent all the while, if for another reason
-                self.note(names, Cause.UNSERVED, unserved)
-            self.note(names, Cause.HUNG, hangs, busy_s=busy_s)
-            self.note(names, Cause.UNSERVED, unserved)
+            self.note(names, Cause.HUNG, hangs)
 
         process.on_stop = stopped
         process.ended.add_done_callback(lambda _: self.forget(names))
@@ -207,18 +190,6 @@ class SilenceMonitor:
         ) + tuple(
             found for name, found in sorted(self._unanswering.items()) if name not in self._silent
         )
-
-    def by_now(self, verdict: Verdict) -> Verdict:
-        """Return a verdict that says for how long nodes have hung by now."""
-        found = []
-        for each in verdict.findings:
-            silence = self._silent.get(each.subject)
-            if each.rule == SILENT_NODE.id and silence and Cause.HUNG in silence.causes:
-                busy_s = self._emit.elapsed_s - silence.hangs_since_s
-                message = f"{_message(each.subject, _why(silence))}; {busy_s:.1f} s by now"
-                each = replace(each, message=message)  # noqa: PLW2901
-            found.append(each)
-        return replace(verdict, findings=tuple(found))
 
 
 def arrivals(before: Collection[str], observation: Observation, emit: Emitter) -> frozenset[str]:

@@ -241,7 +241,7 @@ class Peers:
     def _say(self) -> None:
         """Our own nodes fell silent or came back: say so."""
         liveliness = self._system.liveliness
-        causes = (Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
+        causes = (Cause.HUNG, Cause.STOPPED)
         silent = {name: why for cause in causes for name, why in liveliness.causes(cause).items()}
         if silent == self._silent:
             return

@@ -35,7 +35,7 @@ from lifecycle.supervisor.nodes.driver import (
 from lifecycle.supervisor.nodes.liveliness import SilenceMonitor
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
-from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
+from lifecycle.supervisor.processes.process import ManagedProcess, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.observation import HealthReport, NodeConfiguration
@@ -129,9 +129,9 @@ class NodeRun:
             what += next((each.unhealthy_reason for each in others if each.unhealthy_reason), "")
         return f"asked to {self.wiring}" if self.wiring else what
 
-    def run_delays_s(self) -> tuple[float, float]:
-        """Return the run delays of ours and of its process: ready to run, but without CPU."""
-        return own_run_delay_s(), 0.0 if self.process is None else self.process.run_delay_s()
+    def run_delay_s(self) -> float:
+        """Return how long we, and its process, were ready to run without a CPU."""
+        return run_delay_s() + (0.0 if self.process is None else self.process.run_delay_s())
 
     def where(self) -> str:
         """Return where it is in a step that takes long, for messages; empty if not known."""

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.middleware.process.busy_sign import BusySign, Overdue
+from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class ControlChannel:
         spec: what it hosts.
         on_state: called with what it reports of its nodes unasked, and with each reply that has a
             configuration.
-        on_hang: called with why its executor is busy for too long, with None when it came back.
+        on_hang: called with True when its executor is busy for too long, False when it came back.
 
     Attributes:
         sign: shows whether its executor is busy; None before `open` and once nobody watches it.
@@ -63,7 +63,7 @@ class ControlChannel:
         self,
         spec: HostSpec,
         on_state: Callable[[Event], None],
-        on_hang: Callable[[Overdue | None], None] = lambda _: None,
+        on_hang: Callable[[bool], None] = lambda _: None,
     ) -> None:
         self._spec = spec
         self._on_state = on_state
@@ -173,16 +173,16 @@ class ControlChannel:
             if not self._ready.done():
                 self._ready.set_exception(failure)
         elif event.kind == "beat":
-            self._on_hang(None)
+            self._on_hang(False)
         elif event.kind in ("state", "configuration", "measured", "destroyed"):
             self._on_state(event)
 
     def _look(self) -> None:
         if self.sign is not None:
-            why, again_s = self.sign.look()
+            hangs, again_s = self.sign.look()
             self._looking = asyncio.get_running_loop().call_later(again_s, self._look)
-            if why is not None:
-                self._on_hang(why)
+            if hangs:
+                self._on_hang(True)
 
     def _watch_no_more(self) -> None:
         if self._looking is not None:

@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import (
     OWN_CHILD,
     PROCESS_VARIABLE,
@@ -39,7 +38,6 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
-    SERVES,
     ChildReport,
     ForkRequest,
     ForkServerProcess,
@@ -67,9 +65,6 @@ _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
 
 _LOOK_S = 0.02
-
-_READY_S = 10.0
-"""A fork server serves after 0.2 s; a loaded machine takes longer."""
 
 _HOST = "lifecycle.node.host.host"
 
@@ -102,10 +97,8 @@ class ForkServer:
         self._children: dict[int, _Child] = {}  # those that have not ended, by their requests
         self._next = 0
         # Of a shell that became this process by exec: no part of the run.
-        self._foreign = Lineage().children(os.getpid())
-        self._lineage = Lineage()
+        self._foreign = {*children().get(os.getpid(), ())}
         self.died: asyncio.Future[str] = self._loop.create_future()
-        self._serves = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
         process.socket.setblocking(False)
         self._loop.add_reader(process.socket, self._reports)
@@ -123,24 +116,11 @@ class ForkServer:
 
     def family(self) -> frozenset[int]:
         """Return the pids of all that descends from what was started, but for the fork server."""
-        lineage, roots = Lineage(), {self.pid}
+        roots = {self.pid}
         if self.died.done():
             # What it had adopted, and what it had started, is ours now.
-            roots |= lineage.children(os.getpid()) - self._foreign
-        return frozenset().union(*map(lineage.of, roots)) - {self.pid}
-
-    async def ready(self) -> None:
-        """Have the fork server answer, bounded.
-
-        Raises:
-            BringUpError: it does not, or has died.
-        """
-        self._serves.clear()
-        self._ask(SERVES.encode())
-        if not await set_within(self._serves, _READY_S):
-            raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
-        if self.died.done():
-            raise BringUpError(self.died.result())
+            roots |= {*children().get(os.getpid(), ())} - self._foreign
+        return frozenset(descendants(roots) - {self.pid})
 
     def _ask(self, message: bytes, descriptors: Sequence[int] = ()) -> None:
         """Send a message; raises BringUpError if it has died, or cannot be asked."""
@@ -206,8 +186,8 @@ class ForkServer:
                 signal.pidfd_send_signal(pidfd, number)
 
     def run_delay_s(self, pid: int) -> float:
-        """Return how long a process and its descendants have waited for a processor."""
-        return sum(map(run_delay_s, self._lineage.of(pid)))
+        """Return how long the main thread of a process has waited for a processor."""
+        return run_delay_s(str(pid))
 
     def belonging(self, processes: Mapping[int, str]) -> set[int]:
         """Return the pids of all that processes have started, whether they live or not.
@@ -215,17 +195,15 @@ class ForkServer:
         It belongs to one if it descends from it, is in its session or group, carries its name in
         its environment, or descends from one of these. `processes` are names by pid.
         """
-        lineage = Lineage()
         others = {each.pid for each in self._children.values()} - processes.keys()
-        spared = {each for pid in others for each in lineage.of(pid)}
+        spared = descendants(others)
         names = set(processes.values())
         found = {pid for pid, name in marked(self._process.run_id).items() if name in names}
         for pid in self.family():
             groups = groups_of(pid)
             if not processes.keys().isdisjoint(groups) and spared.isdisjoint(groups):
                 found.add(pid)
-        for pid in (*(found - spared), *processes):
-            found |= lineage.of(pid)
+        found = descendants({*(found - spared), *processes})
         return found - spared - processes.keys() - {os.getpid(), self.pid}
 
     async def end_left(
@@ -264,9 +242,7 @@ class ForkServer:
 
     def _take(self, report: ChildReport, descriptors: list[int]) -> None:
         child = self._children.get(report.id)
-        if report.id == 0:
-            self._serves.set()
-        elif report.id in self._pending:
+        if report.id in self._pending:
             self._born(report, descriptors)
         elif child is not None and report.stopped is not None:
             child.process.on_stop(report.stopped)
@@ -316,7 +292,6 @@ class ForkServer:
         end = ProcessExit.of(self._process.popen.wait())
         self._reports()
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {end}")
-        self._serves.set()
         for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))
@@ -351,7 +326,7 @@ def reap_adopted(spare: Iterable[int]) -> None:
         return
     try:
         spared = set(spare)
-        for pid in Lineage().children(os.getpid()) - spared:
+        for pid in {*children().get(os.getpid(), ())} - spared:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
     finally:
@@ -364,40 +339,25 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= marked(record.run_id).keys()
-    lineage = Lineage()
-    for pid in tuple(pids):
-        pids |= lineage.of(pid)
-    pids.discard(os.getpid())
-    return asyncio.run(end(pids, _ORPHAN_GRACE_S))
+    return asyncio.run(end(descendants(pids) - {os.getpid()}, _ORPHAN_GRACE_S))
 
 
-class Lineage:
-    """Which processes descend from which, as it was at most `FRESH_S` ago: reading all costs ms."""
+def children() -> dict[int, list[int]]:
+    """Return the children of each process, adopted ones included."""
+    found: dict[int, list[int]] = {}
+    for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+        if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+            found.setdefault(parent, []).append(int(entry))
+    return found
 
-    FRESH_S = 0.5
 
-    def __init__(self) -> None:
-        self._read_s = float("-inf")
-        self._children: dict[int, list[int]] = {}
-
-    def children(self, pid: int) -> set[int]:
-        """Return the children of a process, adopted ones included."""
-        if time.monotonic() - self._read_s > self.FRESH_S:
-            self._children = {}
-            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
-                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
-                    self._children.setdefault(parent, []).append(int(entry))
-            self._read_s = time.monotonic()
-        return set(self._children.get(pid, ()))
-
-    def of(self, pid: int) -> set[int]:
-        """Return a process and all that descends from it."""
-        found: set[int] = set()
-        left = {pid}
-        while left:
-            found |= left
-            left = set().union(*map(self.children, left)) - found
-        return found
+def descendants(pids: Iterable[int]) -> set[int]:
+    """Return processes and all that descends from them."""
+    found, left, known = set[int](), {*pids}, children()
+    while left:
+        found |= left
+        left = {child for pid in left for child in known.get(pid, ())} - found
+    return found
 
 
 def marked(run_id: str) -> dict[int, str]:

@@ -74,7 +74,7 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:
-        id: of the ForkRequest; 0 answers SERVES.
+        id: of the ForkRequest.
         pid: of the child; 0 if it could not be forked.
         status: exit code, below 0 for a signal; None while it runs.
         error: why it could not be forked.
@@ -87,12 +87,6 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
     stopped: bool | None = None
 
-
-SERVES = "serves"
-"""A message: say that you serve."""
-
-_PRELOAD = "preload"
-"""Begins a message that names interface types, one a line; requests to fork are JSON."""
 
 _CLOSE_S = 1.0
 """A fork server whose children have ended ends within milliseconds of its socket."""
@@ -149,7 +143,7 @@ class ForkServerProcess:
         if self._preloads and types:
             # One that has died is noticed by what asks it to fork.
             with contextlib.suppress(OSError):
-                self.socket.send("\n".join((_PRELOAD, *types)).encode())
+                self.socket.send("\n".join(types).encode())
 
     def close(self) -> None:
         """End it: it ends once its socket is closed and no child is left. Again is harmless."""
@@ -198,11 +192,7 @@ class _ForkServer:
         if data.startswith(b"{"):
             self._fork(from_json(data, ForkRequest), descriptors)
             return True
-        word, *lines = data.decode().split("\n")
-        if word == SERVES:
-            self._tell(ChildReport(id=0))
-        elif word == _PRELOAD:
-            _preload(lines)
+        _preload(data.decode().split("\n"))
         return True
 
     def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:

@@ -191,7 +191,7 @@ class ManagedProcess:
             self._spawner.signal(self.pid, number)
 
     def run_delay_s(self) -> float:
-        """Return how long its threads, and those of its descendants, waited for a processor."""
+        """Return how long its main thread has waited for a processor."""
         return 0.0 if self._spawner is None else self._spawner.run_delay_s(self.pid)
 
     def settle(self, how: ProcessExit) -> None:
@@ -231,33 +231,16 @@ class ManagedProcess:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
 
 
-def run_delay_s(pid: int) -> float:
-    """Return how long the threads of a process have waited for a processor, all together.
+def run_delay_s(task: str = "thread-self") -> float:
+    """Return how long this thread, or the main thread of a process, has waited for a processor.
 
     Returns:
         Seconds, see "run delay" in sched-stats(Documentation/scheduler); 0 where the kernel does
         not count it or the process has ended.
     """
-    total_ns = 0
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError, PermissionError):
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            total_ns += _run_delay_ns(f"{thread}/schedstat")
-    return total_ns / 1e9
-
-
-def own_run_delay_s() -> float:
-    """Return how long this thread has waited for a processor, in seconds."""
-    return _run_delay_ns("/proc/thread-self/schedstat") / 1e9
-
-
-def _run_delay_ns(path: str) -> int:
     with contextlib.suppress(OSError, ValueError, IndexError):
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            return int(os.read(descriptor, 128).split()[1])
-        finally:
-            os.close(descriptor)
-    return 0
+        return int(Path(f"/proc/{task}/schedstat").read_text().split()[1]) / 1e9
+    return 0.0
 
 
 def why_unlimited() -> str:

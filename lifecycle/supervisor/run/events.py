@@ -14,7 +14,7 @@ import msgspec
 
 from lifecycle.errors import BringUpError
 from lifecycle.node.host.control import Operation
-from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.verify.verdict import Stage, Verdict
 
 
@@ -116,8 +116,8 @@ class NodeSilent(Event, frozen=True, kw_only=True, tag="silent"):
     """Nothing can be expected of a node any more, though it has not left.
 
     Attributes:
-        cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
-            "lost" from the network, or "told" by its own supervisor.
+        cause: "stopped" by a signal, "hung" in a callback, "lost" from the network, or "told" by
+            its own supervisor.
     """
 
     node: str
@@ -274,13 +274,11 @@ class Restarted(Event, frozen=True, kw_only=True, tag="restarted"):
 class GaveUp(Event, frozen=True, kw_only=True, tag="gave_up"):
     """A process failed too often to be started again; the run ends for it.
 
-    Attributes:
-        history: its failures, the last at the end.
+    The finding `run.gave-up` has the last failure; all are events of the run, and in its journal.
     """
 
     process: str
     restarts: int
-    history: tuple[Failed, ...]
 
 
 class ConsequenceTaken(Event, frozen=True, kw_only=True, tag="consequence"):

@@ -140,20 +140,6 @@ class Moment(msgspec.Struct, frozen=True, kw_only=True):
     text: str
 
 
-class RecordedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """A journal that was read.
-
-    Attributes:
-        run: which run it is of; None where no line says so.
-        moments: every line, oldest first.
-        unreadable: (file and line, why) of what was passed over.
-    """
-
-    run: JournaledRun | None
-    moments: tuple[Moment, ...]
-    unreadable: tuple[tuple[str, str], ...]
-
-
 def journal_files(path: Path) -> tuple[Path, ...]:
     """Return the files of a journal, oldest first, by a run's log directory or one of the files.
 
@@ -171,14 +157,13 @@ def journal_files(path: Path) -> tuple[Path, ...]:
     return found
 
 
-def read_run(files: Iterable[Path]) -> RecordedRun:
-    """Read a journal; a line that cannot be read is passed over, and named.
+def read_run(files: Iterable[Path], passed_over: Callable[[str], None]) -> list[Moment]:
+    """Read a journal, oldest first; a line that cannot be read is passed over, and named.
 
     Raises:
         UsageError: a file cannot be read at all.
     """
     moments: list[Moment] = []
-    unreadable: list[tuple[str, str]] = []
     for path in files:
         try:
             content = path.read_bytes().splitlines(keepends=True)
@@ -190,12 +175,11 @@ def read_run(files: Iterable[Path]) -> RecordedRun:
                 event = None if line.event is None else from_record(line.event)
             except ValueError as error:
                 why = str(error) if data.endswith(b"\n") else "it is incomplete"
-                unreadable.append((f"{path.name}:{number}", why))
+                passed_over(f"{path.name}:{number}: {why}")
                 continue
             text = data.decode(errors="replace").rstrip("\n")
             moments.append(Moment(line=line, event=event, text=text))
-    run = next((each.line.run for each in moments if each.line.run), None)
-    return RecordedRun(run=run, moments=tuple(moments), unreadable=tuple(unreadable))
+    return moments
 
 
 _TIMES_PER_LIMIT = 2

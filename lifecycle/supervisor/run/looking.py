@@ -88,17 +88,13 @@ class JudgedSystem(msgspec.Struct, frozen=True, kw_only=True):
         return tuple(each for each in (self.limits, self.where) if each)
 
 
-def judge_running(
-    plan: Plan, *, timeout_s: float, strict: bool, empty_graph_s: float | None = None
-) -> JudgedSystem:
+def judge_running(plan: Plan, *, timeout_s: float, strict: bool) -> JudgedSystem:
     """Judge what runs against the plan, as an active system.
 
     Args:
         plan: what should run.
         timeout_s: seconds, > 0, to wait for a verdict that is ok.
         strict: wait for what is unverifiable too.
-        empty_graph_s: seconds, > 0, after which a graph without any node is not waited for; None
-            waits as long for a system to be started as for anything else.
 
     Raises:
         MiddlewareError: no participant can be made.
@@ -111,10 +107,7 @@ def judge_running(
             observation = await participant.graph.observe(plan)
             # One that is not there may be yet to come.
             seen = _judged(plan, observation, participant, may_be_over=False)
-            limit_s = timeout_s
-            if empty_graph_s is not None and seen.where:
-                limit_s = min(empty_graph_s, timeout_s)
-            left_s = began + limit_s - loop.time()
+            left_s = began + timeout_s - loop.time()
             if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
                 unanswered = await _unanswering(plan, observation, participant)
                 return _judged(plan, observation, participant, unanswered=unanswered)

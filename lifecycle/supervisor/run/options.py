@@ -131,27 +131,6 @@ def own_machines(plan: Plan | Manifest, machine: str) -> frozenset[str]:
     return frozenset({"", *(each.name for each in filter(is_local, plan.machines))})
 
 
-def address_that_is_down(plan: Plan, machine: str) -> str:
-    """Return the address of this machine where its interface is down; empty if all is well.
-
-    What an interface is needed for is a node of another machine. Fast DDS looks for interfaces when
-    it makes a participant, and never again: one that is made while a cable is out stays alone.
-    """
-    own = own_machines(plan, machine)
-    if all(each.machine in own for each in plan.nodes):
-        return ""
-    import psutil
-
-    wanted = {each.address for each in plan.machines if each.name in own and each.address}
-    states = psutil.net_if_stats()
-    for name, addresses in psutil.net_if_addrs().items():
-        for each in addresses:
-            address = each.address.partition("%")[0]
-            if address in wanted and name in states and not states[name].isup:
-                return address
-    return ""
-
-
 def local_processes(plan: Plan, machine: str) -> tuple[PlannedProcess, ...]:
     """Return the processes that this supervisor starts or attaches to.
 

@@ -11,19 +11,17 @@ import contextlib
 import gc
 import os
 import re
-import time
 import traceback
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode, MiddlewareError
+from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.fastdds.discovery import (
     all_by_multicast,
     discovery_peers,
-    missing_port,
     peers_environment,
 )
 from lifecycle.middleware.fastdds.profiles import (
@@ -54,7 +52,6 @@ from lifecycle.run_directory import (
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
-from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.control.status import ended_early
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.fork_server import ForkServer, end_run
@@ -76,7 +73,6 @@ from lifecycle.supervisor.run.journal import Journal, ServiceManager
 from lifecycle.supervisor.run.options import (
     UpOptions,
     UpResult,
-    address_that_is_down,
     local_processes,
     observer_connections,
     own_machines,
@@ -176,7 +172,7 @@ def up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server)
-                observer_participant = await _observer_participant(plan, options, emit, ending)
+                observer_participant = await _observer_participant(plan, options, emit)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 await _adopt(system, observer_participant)
                 emit(
@@ -268,29 +264,12 @@ within milliseconds, one that sends nothing perhaps never. Then the port stays f
 
 
 _SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
-_INTERFACE_S = 0.05
-
-
-async def _until_interface_is_up(plan: Plan, options: UpOptions, emit: Emitter) -> None:
-    """Wait, bounded, before any participant is made that would never use this host's address."""
-    deadline_s = time.monotonic() + options.bring_up_s(0)
-    said = ""
-    while (address := address_that_is_down(plan, options.machine)) and (
-        time.monotonic() < deadline_s
-    ):
-        if address != said:
-            said = address
-            message = f"waits until the network interface with {address} is up: what is made before"
-            emit(Notice(message=f"{message} would not be found from other machines"))
-        await asyncio.sleep(_INTERFACE_S)
 
 
 async def _observer_participant(
-    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
+    plan: Plan, options: UpOptions, emit: Emitter
 ) -> ObserverParticipant:
     """Make the supervisor's participant."""
-    with ending.raised():
-        await _until_interface_is_up(plan, options, emit)
     # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
     load_type_support("rcl_interfaces/msg/ParameterEvent")
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
@@ -309,18 +288,6 @@ async def _observer_participant(
             settle_s=plan.discovery.settle_s,
         )
     discovery = observer_participant.discovery
-    # Nodes elsewhere would be found: they answer to ports of ours.
-    port = None
-    if plan.processes:
-        port = missing_port(discovery.domain_id, discovery.urls, os.environ)
-    if port is not None:
-        observer_participant.destroy()
-        raise MiddlewareError(
-            f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "
-            "which all participants find each other, is taken by something else",
-            hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
-            "`lifecycle ports` says which are safe",
-        )
     if unasked_s := discovery.settling.unasked_s:
         emit(
             Notice(
@@ -364,7 +331,6 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
             wait for ever.
     """
     check_log_root(os.environ)
-    check_installed(plan.policy)
     # What was loaded stays. To look through all of it whenever garbage is collected takes 40 ms,
     # and once more at the very end, when who asked for the end waits for nothing else.
     gc.freeze()

@@ -24,7 +24,7 @@ from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.core import messages
 from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
-from lifecycle.supervisor.core.state import NEVER_S, REACHES, Level, Request, Step
+from lifecycle.supervisor.core.state import REACHES, Level, Step
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
@@ -52,9 +52,6 @@ if TYPE_CHECKING:
 _DEATH_S = 0.5
 """A closed channel usually means a dying process; its end says more than the channel did."""
 
-_SLICE_S = 1.0
-"""What is done within this, or a tenth of its limit, is not worth looking whether it had a CPU."""
-
 _REOPENS_S = 1.0
 """What changes as others are activated is judged within milliseconds, on a loaded machine later."""
 
@@ -71,8 +68,7 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
-        # Number of a request, and the run delays as it began.
-        self._noted: dict[str, tuple[int, tuple[float, ...]]] = {}
+        self._delayed_s: dict[str, float] = {}  # run delay of a node as its request began
         self._found: set[str] = set()
 
     def ask(self, effect: messages.Ask) -> None:
@@ -80,16 +76,7 @@ class Requests:
         node = self._system.nodes[effect.node]
         task = self._shell.start(self._carry_out(node, effect))
         self._tasks[effect.node] = effect.number, task
-        if (request := node.core.request) is not None and request.limit_s < NEVER_S:
-            asyncio.get_running_loop().call_later(_slice_s(request), self._note, node, request)
-
-    def _note(self, node: NodeRun, request: Request) -> None:
-        """Note the run delay of a step that takes long; to read it costs a file of each thread."""
-        if node.core.request is request:
-            # That it is read late is the machine's fault, too.
-            late_s = max(0.0, self._shell.now_s() - request.since_s - _slice_s(request))
-            delays_s = tuple(each - late_s for each in node.run_delays_s())
-            self._noted[node.core.key] = request.number, delays_s
+        self._delayed_s[effect.node] = node.run_delay_s()
 
     def tick(self, at_s: float) -> messages.Tick:
         """Return a tick with what is known of late requests: time without a CPU does not count."""
@@ -99,13 +86,11 @@ class Requests:
             request, node = each.request, self._system.nodes[key]
             if request is None or at_s < late_at_s(request):
                 continue
-            number, noted_s = self._noted.get(key, (0, ()))
-            noted_s = noted_s if number == request.number else ()
-            waits_s = (now - then for now, then in zip(node.run_delays_s(), noted_s, strict=False))
-            # One waits for the other, too; both at once no longer than there is time.
-            delay_s = max(0.0, min(sum(waits_s), at_s - request.since_s))
+            # Of us and of it: both at once no longer than there is time.
+            delay_s = node.run_delay_s() - self._delayed_s[key]
+            delay_s = max(0.0, min(delay_s, at_s - request.since_s))
             left_s = late_at_s(replace(request, waited_s=delay_s)) - at_s
-            if left_s >= _slice_s(request):
+            if left_s >= min(1.0, request.limit_s / 10):
                 waited_s[key] = delay_s
             else:
                 where[key] = node.where()
@@ -343,10 +328,6 @@ class Requests:
             # Judged by what it has then, which names the parameter.
             self._system.emit(Notice(message=error.message))
         self._system.touch()
-
-
-def _slice_s(request: Request) -> float:
-    return min(_SLICE_S, request.limit_s / 10)
 
 
 def _applies(step: Step, node: NodeRun) -> bool:

@@ -31,7 +31,7 @@ from lifecycle.supervisor.control.status import process_state, result_of, system
 from lifecycle.supervisor.core import advance, gate, messages
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
-from lifecycle.supervisor.core.orders import STARTS, refused_at_once
+from lifecycle.supervisor.core.orders import refused_at_once
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.nodes.liveliness import Answering, Cause
 from lifecycle.supervisor.nodes.peers import FAILED, Peers
@@ -179,13 +179,6 @@ class Supervisor:
         if change is not None and order.dry_run:
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Answer(exit_code=code if why else differs, error=why, change=change)
-        if order.ask in STARTS and not why:
-            try:
-                await self.means.fork_server.ready()
-            except BringUpError as error:
-                why = f"{error.message}; everything stays as it is"
-                text = f"cannot {order.ask.value} {order.node or run.plan.system!r}: {why}"
-                return Answer(exit_code=ExitCode.BRING_UP_FAILED, error=text)
         order = replace(order, id=len(self._answers))
         answer = self._answers[order.id] = self._loop.create_future()
         self.give(messages.Ordered(order=order))
@@ -470,8 +463,7 @@ class Supervisor:
     def _end(self, ending: core.Ending) -> None:
         if self._last is not None:
             return
-        latest = self.system.run.judged.verdict
-        self._last = NOT_JUDGED if latest is None else self.system.liveliness.by_now(latest)
+        self._last = self.system.run.judged.verdict or NOT_JUDGED
         how = FAILED if ending.failed else ""
         self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()

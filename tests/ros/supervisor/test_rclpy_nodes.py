@@ -324,7 +324,7 @@ def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_be
         for kind in ("silent", "alive"):
             for name in ("/many", "/events"):
                 up.met(kind, node=name)
-        assert {each["cause"] for each in up.of_kind("silent")} <= {"hung", "unserved"}
+        assert {each["cause"] for each in up.of_kind("silent")} <= {"hung"}
         wait_until(lambda: "slept" in log_of(up, "beside"))
         up.catch_up()
         assert {each["node"] for each in up.of_kind("silent")} == {"/many", "/events"}

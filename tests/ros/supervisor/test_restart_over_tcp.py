@@ -22,6 +22,11 @@ def by_tcp(directory: Path, domain_id: int, **discovery: str) -> Path:
     return pair(directory, domain_id, edit={"discovery": how})
 
 
+@pytest.mark.parametrize(
+    ("mode", "orders"),
+    [("static", (("talker",), ("listener",))), ("server", (("listener",), ()))],
+    ids=["static", "server"],
+)
 def test_who_is_restarted_or_killed_is_found_again(
     tmp_path: Path, fresh_domain: int, mode: str, orders: tuple[tuple[str, ...], ...]
 ) -> None:

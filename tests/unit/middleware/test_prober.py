@@ -15,14 +15,11 @@ from lifecycle.middleware.fastdds import prober as probing
 from lifecycle.middleware.fastdds.discovery import (
     chosen_otherwise,
     is_served,
-    missing_port,
     reach,
     settle_s,
 )
 from lifecycle.middleware.fastdds.prober import ANSWER_S, Prober, Settling, leave_all
 from lifecycle.network.connection_url import parse
-from lifecycle.network.ports import participant_ports
-from lifecycle.pytest_plugin import claimed_domain
 from tests.unit.middleware.other_process import of_another_process
 
 _WAIT_S = 5.0
@@ -118,42 +115,6 @@ def profile(tmp_path: Path, element: str) -> dict[str, str]:
         <rtps>{element}</rtps></participant></profiles></dds>"""
     )
     return {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}
-
-
-_SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
-
-
-@pytest.mark.parametrize(
-    ("url", "environment", "misses"),
-    [
-        ("", _SUBNET, True),
-        ("", {}, True),
-        ("", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, False),
-        ("", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, False),
-        ("", {**_SUBNET, "ROS_STATIC_PEERS": "127.0.0.1"}, False),
-        ("", {**_SUBNET, "ROS_DISCOVERY_SERVER": "127.0.0.1"}, False),
-        ("udpv4://127.0.0.1:7911?metatraffic_port=7910", _SUBNET, False),
-    ],
-)
-def test_the_port_of_multicast_is_missing_where_only_another_process_has_it(
-    url: str, environment: dict[str, str], *, misses: bool
-) -> None:
-    urls = (parse(url),) if url else ()
-    with claimed_domain() as domain, contextlib.ExitStack() as stack:
-        port = participant_ports(domain, 0).discovery_multicast
-        assert missing_port(domain, urls, environment) is None
-        stack.enter_context(of_another_process(_sharing(port)))
-        assert missing_port(domain, urls, environment) == (port if misses else None)
-        stack.enter_context(_sharing(port))
-        assert missing_port(domain, urls, environment) is None
-
-
-def _sharing(port: int) -> socket.socket:
-    """Return a socket at a port that others may have, too, as Fast DDS has it for multicast."""
-    shared = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    shared.bind(("", port))
-    return shared
 
 
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:

@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
@@ -288,7 +287,6 @@ class FakeForkServer:
         takes_s: how long such a line takes.
         starves: by process, for how much of the time its threads wait for a processor, added up.
         ends_at: processes that do not end by themselves, and the signal that ends them.
-        cannot_start: why it cannot start processes; empty while it can.
         lingers_s: seconds for which discovery shows the nodes of a process that has ended.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
@@ -302,7 +300,6 @@ class FakeForkServer:
         self.takes_s: dict[str, float] = {}
         self.starves: dict[str, float] = {}
         self.ends_at: dict[str, int] = {}
-        self.cannot_start = ""
         self.lingers_s = 0.0
         self.processes: dict[str, FakeProcess] = {}
         self._by_pid: dict[int, FakeProcess] = {}
@@ -359,10 +356,6 @@ class FakeForkServer:
             )
         self.interfaces[command.node] = interface
         return interface
-
-    async def ready(self) -> None:
-        if self.cannot_start:
-            raise BringUpError(self.cannot_start)
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None

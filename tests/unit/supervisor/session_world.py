@@ -172,10 +172,9 @@ class FakeParticipant(FakeAir):
         unseen: nodes that discovery does not show.
         mute: nodes whose state cannot be learnt from the graph.
         pids: of the processes that `others` run in, where they are known.
-        twice: names that several nodes carry.
         services: of the nodes in `others`.
         changes: so far; `looks`: how often it was looked.
-        dropped: nodes whose reports were forgotten; `forgotten`: processes that were.
+        forgotten: processes that were.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         no_ros: why it cannot be made; empty if it can.
@@ -185,12 +184,10 @@ class FakeParticipant(FakeAir):
         super().__init__()
         self.others: dict[str, str] = {}
         self.pids: dict[str, int] = {}
-        self.twice: set[str] = set()
         self.unseen: set[str] = set()
         self.mute: set[str] = set()
         self.services = FakeServices(self, hosts)
         self.changes = self.looks = 0
-        self.dropped: list[str] = []
         self.forgotten: list[int] = []
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
@@ -240,7 +237,6 @@ class FakeParticipant(FakeAir):
                 ObservedNode(
                     full_name=name,
                     state=None if name in self.mute else state or None,
-                    count=1 + (name in self.twice),
                 )
                 for name, state in there.items()
             ),
@@ -261,7 +257,6 @@ class FakeParticipant(FakeAir):
         """Nothing is measured here."""
 
     def drop_configuration(self, node: str) -> None:
-        self.dropped.append(node)
         self._reports.pop(node, None)
 
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
@@ -621,9 +616,10 @@ class SessionWorld(World):
 
     def _check_journal(self) -> None:
         """Check that the journal tells the same story."""
-        recorded = read_run(journal_files(self._tmp_path / "logs"))
-        assert recorded.unreadable == ()
-        told = [_line(each.event, 0.0) for each in recorded.moments if each.event is not None]
+        unreadable: list[str] = []
+        recorded = read_run(journal_files(self._tmp_path / "logs"), unreadable.append)
+        assert unreadable == []
+        told = [_line(each.event, 0.0) for each in recorded if each.event is not None]
         story = [line for line in self.story if line.startswith("[") and line != "[log]"]
         assert [line.partition(" at ")[0] for line in told] == [
             line.partition(" at ")[0] for line in story

@@ -68,8 +68,8 @@ def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(kept: Kept) -> 
         kept.say(f"{number}")
     older, newest = journal_files(kept.directory)
     assert older.stat().st_size < 2_200
-    assert all(read_run([each]).run is not None for each in (older, newest))
-    said = [each.event.message for each in read_run((older, newest)).moments if each.event]
+    assert all(read_run([each], print)[0].line.run is not None for each in (older, newest))
+    said = [each.event.message for each in read_run((older, newest), print) if each.event]
     assert said == [f"{number}" for number in range(40 - len(said), 40)]
 
 
@@ -78,12 +78,11 @@ def test_a_torn_line_and_a_foreign_one_are_passed_over_and_named(kept: Kept) -> 
     (file,) = journal_files(kept.directory)
     with file.open("ab") as journal:
         journal.write(b'{"event": 7}\n\x00\xff\n' + file.read_bytes().splitlines()[-1][:50])
-    recorded = read_run(journal_files(kept.directory))
-    assert [place for place, _ in recorded.unreadable] == [
-        f"journal.jsonl:{number}" for number in (3, 4, 5)
-    ]
-    assert recorded.unreadable[-1][1] == "it is incomplete"
-    assert len(recorded.moments) == 2
+    unreadable: list[str] = []
+    assert len(read_run(journal_files(kept.directory), unreadable.append)) == 2
+    places = [each.partition(": ")[0] for each in unreadable]
+    assert places == [f"journal.jsonl:{number}" for number in (3, 4, 5)]
+    assert unreadable[-1].endswith(": it is incomplete")
 
 
 def _verb(command: object, *words: str) -> tuple[int, str]:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
-from types import SimpleNamespace
 
 import pytest
-from msgspec.structs import replace
 
 from lifecycle.graph.loop import ended
-from lifecycle.manifest.model import Condition, Machine
-from lifecycle.supervisor.run.options import address_that_is_down
+from lifecycle.manifest.model import Condition
 from lifecycle.supervisor.shell.looks import conditions
 from lifecycle.verify.observation import Observation, ObservedNode
-from tests.builders import HERE, configuration, plan_of, planned_node
+from tests.builders import configuration, planned_node
 
 STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY = Condition
 
@@ -65,32 +61,3 @@ async def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
     await ended(task)
     assert task.cancelled()
     assert lost == [None]
-
-
-@pytest.mark.parametrize(
-    ("machine", "is_up", "expected"),
-    [
-        ("left", False, "192.0.2.1"),
-        ("", False, "192.0.2.1"),  # that host's own by its address
-        ("left", True, ""),
-        ("right", False, ""),  # it has no such address: behind a NAT, in a container
-    ],
-)
-def test_a_machine_waits_for_the_interface_with_its_address_where_others_are_to_find_it(
-    machine: str, is_up: bool, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    address = SimpleNamespace(address="192.0.2.1", family=socket.AF_INET)
-    monkeypatch.setattr("psutil.net_if_addrs", lambda: {"e0": [address]})
-    monkeypatch.setattr("psutil.net_if_stats", lambda: {"e0": SimpleNamespace(isup=is_up)})
-    nodes = [
-        replace(planned_node(key), machine=of)
-        for key, of in (("camera", "left"), ("viewer", "right"))
-    ]
-    machines = tuple(
-        Machine(name=each, address=f"192.0.2.{number}", at=HERE)
-        for number, each in enumerate(("left", "right"), 1)
-    )
-    plan = replace(plan_of(*nodes), machines=machines)
-    assert address_that_is_down(plan, machine) == expected
-    alone = replace(plan, nodes=plan.nodes[:1])
-    assert address_that_is_down(alone, "left") == ""

@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from lifecycle.manifest.model import Timeouts
-from lifecycle.middleware.process.busy_sign import BusySign, Overdue
+from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.supervisor.nodes.liveliness import Cause, SilenceMonitor
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
 from lifecycle.supervisor.run.events import (
@@ -63,7 +63,7 @@ def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
 
     async def test() -> None:
         node = planned_node("camera", timeouts=Timeouts(silent_s=0.05))
-        told: asyncio.Queue[Overdue | None] = asyncio.Queue()
+        told: asyncio.Queue[bool] = asyncio.Queue()
         channel = ControlChannel(host_spec(node), lambda _: None, told.put_nowait)
         theirs = await channel.open()
         _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import sys
 from pathlib import Path
 
 import jsonschema
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode, MiddlewareError
+from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.measure.flows import FlowMeasurement, Kind, MeasuredBound
 from lifecycle.supervisor.control.ros_interface import (
@@ -23,7 +21,6 @@ from lifecycle.supervisor.control.ros_interface import (
     WARN,
     Entry,
     Reported,
-    check_installed,
     diagnostics,
 )
 from lifecycle.supervisor.nodes.liveliness import Cause
@@ -85,23 +82,6 @@ async def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(
     assert said == [f"[notice] {why}; {off}"]
     assert world.result is not None
     assert world.result.exit_code is ExitCode.OK
-
-
-@pytest.mark.parametrize("required", [True, False], ids=str)
-def test_what_a_manifest_asks_for_must_be_installed(
-    required: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "diagnostic_msgs", None)
-    policy = Policy(ros_interface=FULL if required else None)
-    refused = pytest.raises(MiddlewareError) if required else contextlib.nullcontext()
-    with refused as error:
-        check_installed(policy)
-    check_installed(replace(policy, ros_interface=OFF))
-    if error is not None:
-        assert str(error.value) == (
-            "cannot offer 'policy: {ros_interface: full}': no Python package diagnostic_msgs is "
-            "installed; install it, or write 'policy: {ros_interface: off}'"
-        )
 
 
 async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_something_changed(

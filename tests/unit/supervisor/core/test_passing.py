@@ -185,31 +185,6 @@ def test_all_that_fails_side_by_side_is_named_and_no_other_step_begins() -> None
     assert play.failures == [("/b", "no camera"), ("/c", "no arm")]
 
 
-def test_a_lone_failure_waits_for_nobody_who_is_not_in_a_step() -> None:
-    plan = plan_of(planned_node("a"), planned_node("b", after={"a": Condition.ACTIVE}))
-    play = Play(plan, ways={"a connect": "no network"})
-    assert play.failures == [("/a", "no network")]
-    assert play.run.ending is not None
-
-
-def test_nodes_of_others_that_fail_side_by_side_are_all_named() -> None:
-    ways = {"a configure": "hang", "b configure": "no arm"}
-    play = Play(plan_of(*(planned_node(key, kind=RunKind.ATTACH) for key in "ab")), ways=ways)
-    play.finish("a configure", error="no leg")
-    assert play.failures == [("/b", "no arm"), ("/a", "no leg")]
-
-
-def test_processes_that_die_one_after_the_other_are_all_named() -> None:
-    plain = (planned_node(key, kind=RunKind.COMMAND, managed=False) for key in "ab")
-    play = Play(plan_of(*plain, planned_node("c")), ways={"c start": "hang"})
-    play.die("a", status=127)
-    play.wait(0.1)
-    play.die("b", status=127)
-    play.wait(ALSO_S)
-    assert [each.subject for each in play.heard(Failure)] == ["/a", "/b"]
-    assert play.reason == "failed: /a (run.process-died), /b (run.process-died)"
-
-
 def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other() -> None:
     play = Play(plan_of(*(planned_node(key, process="all") for key in "abc")), {"a start": "hang"})
     reports = (("/b", "no module 'driver'"), ("/c", "cannot import 'm:C'"))

@@ -24,10 +24,12 @@ from lifecycle.supervisor.core.advance import wanted
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, new_run
 from lifecycle.supervisor.run.events import (
+    ConsequenceTaken,
     Failure,
+    SystemReached,
     VerdictChanged,
 )
-from lifecycle.supervisor.run.options import Until, UpOptions
+from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.core.playbook import AGAIN, CHAIN, GONE, INTRUDER, Play, chain
@@ -59,24 +61,6 @@ def test_a_plain_node_that_will_not_deactivate_is_started_anew_and_has_no_level_
     assert play.levels == "1"
     play.order(ControlRequest.RESUME)
     assert (play.levels, play.phase) == ("4", "active")
-
-
-@pytest.mark.parametrize(
-    ("options", "levels", "furthest"),
-    [
-        ({"until": Until.CONNECTED, "stop_after_s": 0.0}, "3 3", "connected"),
-        ({"until": Until.VERIFIED, "stop_after_s": 0.0}, "3 3", "verified"),
-        ({"stop_after_s": 0.0}, "4 4", "active"),
-    ],
-)
-def test_a_system_is_brought_as_far_as_asked(
-    options: dict[str, Any], levels: str, furthest: str
-) -> None:
-    play = Play(CHAIN, **{**options, "stop_after_s": 60.0})
-    assert play.levels == levels
-    play = Play(CHAIN, **options)
-    assert play.run.furthest == furthest
-    assert play.code == 0
 
 
 def test_what_changes_while_it_is_looked_at_is_looked_at_again() -> None:
@@ -138,14 +122,6 @@ def test_a_process_that_dies_while_it_is_taken_down_is_in_the_exit_code() -> Non
     assert play.code == 6
 
 
-def test_a_node_of_others_is_configured_and_left_as_it_was_found() -> None:
-    plan = plan_of(planned_node("base", kind=RunKind.ATTACH))
-    play = Play(plan)
-    assert play.levels == "4"
-    assert play.down() == ["base deactivate", "base disconnect", "base cleanup"]
-    assert play.code == 0
-
-
 def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
     plan = plan_of(planned_node("far"), planned_node("near", after={"far": Condition.CONFIGURED}))
     play = Play(plan)
@@ -196,13 +172,6 @@ def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
 # Failures
 
 
-def test_dependents_go_down_in_order_and_come_again_with_it() -> None:
-    play = Play(chain(msgspec.structs.replace(AGAIN, on_failure=OnFailure.DEPENDENTS)))
-    assert play.die("camera")[-2:] == ["signal viewer 0", "sweep viewer"]
-    play.wait(1.0)
-    assert play.levels == "4 4"
-
-
 def test_a_death_ends_the_run_unless_it_is_to_keep_going() -> None:
     play = Play(CHAIN)
     play.die("camera")
@@ -219,17 +188,6 @@ def test_a_death_before_the_system_was_up_ends_the_run_also_if_it_is_to_keep_goi
     play.die("camera")
     play.wait(60.0)
     assert (play.code, play.reason) == (6, "failed: /camera (run.process-died)")
-
-
-def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not() -> None:
-    how = msgspec.structs.replace(AGAIN, watchdog_sec=2.0)
-    play = Play(chain(how))
-    play.give(messages.Silent(node="camera", why="it hangs", hangs=True))
-    play.give(messages.Silent(node="camera"))
-    assert play.wait(3.0) == []
-    play.give(messages.Silent(node="camera", why="it hangs", hangs=True))
-    assert play.wait(2.0) == ["signal camera 9", "sweep camera"]
-    assert "its watchdog ended it" in play.run.processes["camera"].failures[0].message
 
 
 def test_a_node_that_others_activate_is_deactivated_and_at_last_left() -> None:
@@ -312,6 +270,17 @@ def test_one_node_is_restarted_through_the_gate_and_waits_for_an_order_if_that_s
     assert play.see() == []
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+def test_a_plain_process_that_was_restarted_passes_the_gate_and_its_ports_are_programmed() -> None:
+    plain = planned_node("driver", managed=False, kind=RunKind.COMMAND, supervision=AGAIN)
+    play = Play(plan_of(plain, planned_node("viewer")))
+    play.die("driver")
+    play.see(("graph.missing-node", "/driver"))
+    assert play.wait(5.0) == ["spawn driver", "driver start"]
+    assert play.see() == ["program"]
+    said = [each.reached for each in play.events if isinstance(each, SystemReached)]
+    assert said == ["connected", *2 * ["verified", "active"]]
 
 
 def test_a_gate_stays_closed_for_good_only_by_a_verdict_of_what_is_there_now() -> None:
@@ -432,6 +401,19 @@ def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resume
     assert play.levels == "4 3"
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+def test_a_node_that_others_activate_again_for_ever_has_its_consequence_once() -> None:
+    reaction = Reaction(rule="param", what=Consequence.DEACTIVATE)
+    play = Play(
+        replace(plan_of(planned_node("base", kind=RunKind.ATTACH)), on_violation=(reaction,))
+    )
+    play.see(("param.value-differs", "/base"))
+    assert play.wait(1.0) == ["base deactivate"]
+    for _ in range(6):
+        play.give(messages.Saw(levels={"base": Level.ACTIVE}))
+    play.wait(2.0)
+    assert (play.levels, len(play.heard(ConsequenceTaken))) == ("4", 1)
 
 
 @pytest.mark.parametrize("what", [Consequence.PAUSE, Consequence.DEACTIVATE])
