@@ -66,9 +66,7 @@ def _wait_again(run: Run) -> None:
     if run.asked is not None:
         return
     busy = run.switch is not None or run.change is not None or run.held_s is None
-    # A plain node waits for no gate: what it brought along is verified, and programmed, too.
-    back = any(each.away_s is not None and not each.failed for each in run.processes.values())
-    if busy or not (advance.waiting(run) or back) or not advance.is_at_gate(run):
+    if busy or not (advance.waiting(run) or run.again) or not advance.is_at_gate(run):
         run.passage = None
     elif run.passage is None:
         run.passage = Passage(until_s=run.now_s + run.timeout_s, asked=False, mark=0)
@@ -164,7 +162,7 @@ def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
 
 
 def _passed(run: Run) -> list[Event]:
-    run.passage = None
+    run.passage, run.again = None, False
     for node in run.nodes.values():
         if node.level is Level.ACTIVE:
             node.guarded = 0
@@ -186,7 +184,7 @@ def _withdraw(run: Run, passage: Passage) -> list[Event]:
     for node in begun:
         node.let_through = False
     run.paused = run.paused or passage.paused
-    run.passage = None
+    run.passage, run.again = None, False
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 

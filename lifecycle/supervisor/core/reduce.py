@@ -420,11 +420,10 @@ def _returned(run: Run) -> list[Event]:
         return []
     for process in run.processes.values():
         members = [*run.nodes_of(process.name)]
-        # A plain one is verified with what waits for the gate, see passing.py.
-        verified = any(each.is_gated for each in members) or run.passage is run.asked
         if process.away_s is not None and all(
-            verified and Level.DOWN < advance.wanted(run, each) <= each.level for each in members
+            Level.DOWN < advance.wanted(run, each) <= each.level for each in members
         ):
+            run.again = run.again or not any(each.is_gated for each in members)
             events.append(
                 Restarted(
                     process=process.name,

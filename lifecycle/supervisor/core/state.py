@@ -472,6 +472,8 @@ class Run(msgspec.Struct, kw_only=True):
         elsewhere: conditions that nodes of other supervisors have reached, by key.
         left: full names of nodes whose supervisor was shut down, and said so.
         early: keys of the nodes that are configured before any node is wired.
+        again: plain nodes have come again: they wait at no gate, and what they brought along is
+            verified, and programmed, like that of those who do.
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
         to_give: parameters of running nodes that are set first, None for all of its mode; `giving`:
@@ -504,6 +506,7 @@ class Run(msgspec.Struct, kw_only=True):
     revisions: int = 1
     mode: str = ""
     now_s: float = 0.0
+    again: bool = False
     mark: int = 0
     requests: int = 0
     judged: Judged = msgspec.field(default_factory=Judged)
