@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import ended
@@ -33,7 +34,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import NOT_ANSWERING, SILENT_NODE
 from lifecycle.verify.tool_filter import is_hidden_node, tolerating_pattern
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
@@ -190,6 +191,18 @@ class SilenceMonitor:
         ) + tuple(
             found for name, found in sorted(self._unanswering.items()) if name not in self._silent
         )
+
+    def by_now(self, verdict: Verdict) -> Verdict:
+        """Return a verdict that says for how long silent nodes have been so by now."""
+
+        def said(finding: Finding) -> Finding:
+            silence = self._silent.get(finding.subject)
+            if finding.rule != SILENT_NODE.id or silence is None:
+                return finding
+            silent_s = self._emit.elapsed_s - silence.since_s
+            return replace(finding, message=f"{finding.message}; {silent_s:.1f} s by now")
+
+        return replace(verdict, findings=tuple(map(said, verdict.findings)))
 
 
 def arrivals(before: Collection[str], observation: Observation, emit: Emitter) -> frozenset[str]:

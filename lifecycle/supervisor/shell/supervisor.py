@@ -463,7 +463,8 @@ class Supervisor:
     def _end(self, ending: core.Ending) -> None:
         if self._last is not None:
             return
-        self._last = self.system.run.judged.verdict or NOT_JUDGED
+        latest = self.system.run.judged.verdict or NOT_JUDGED
+        self._last = self.system.liveliness.by_now(latest)
         how = FAILED if ending.failed else ""
         self.peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()

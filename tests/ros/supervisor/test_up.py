@@ -310,7 +310,7 @@ def test_a_run_that_is_ended_before_it_was_verified_is_no_success(
         assert run.of_kind("gate") == []
         cases = _cases(report)
         assert cases["run: end"] == "failure"
-        assert cases["graph.missing-node: /third"] == "failure"
+        assert cases["graph.missing-node: a declared node is not in the graph"] == "failure"
         run.assert_nothing_left()
 
 
