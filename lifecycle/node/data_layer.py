@@ -8,6 +8,7 @@ control channel: "Node Interface" of *Topological Discovery and Communication Ne
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -310,7 +311,11 @@ class DataLayer:
 
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make a connection, or return the present one: LifecycleNode.connect_to."""
-        self._refuse_unconfigured(f"connect {self._name} to {name!r}")
+        self._refuse_unconfigured(f"connect {self._name} to {', '.join(how.urls) or repr(name)}")
+        taken = {each.name for each in self.connections.named}
+        name = name or next(
+            made for made in map("connection_{}".format, itertools.count(1)) if made not in taken
+        )
         try:
             return self.connections.connect_to(name, how)
         finally:

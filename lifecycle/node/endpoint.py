@@ -22,6 +22,7 @@ from rclpy.event_handler import (
 )
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import qos_profile_system_default
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
@@ -243,7 +244,11 @@ _DESTROY = {
 def make_entity(managed: Managed, endpoint: Endpoint, connection: Connection) -> Any:
     """Return a new rclpy entity of an endpoint; raises LifecycleError, and nothing is left."""
     create = _topic_end if endpoint.kind.is_topic else _served
-    return create(managed, endpoint, connection, _name(managed, endpoint, connection))
+    entity = create(managed, endpoint, connection, _name(managed, endpoint, connection))
+    if introspection := endpoint.options.get("introspection"):
+        clock = managed.node.get_clock()
+        entity.configure_introspection(clock, qos_profile_system_default, introspection)
+    return entity
 
 
 def unmake(managed: Managed, kind: EndpointKind, entity: Any, connection: Connection) -> None:
@@ -317,6 +322,7 @@ def _served_on(managed: Managed, endpoint: Endpoint, node: Node, *, name: str) -
         managed.gate.add(goals.server, goals)
         return goals.server
     options = {**endpoint.options, "callback_group": group}
+    options.pop("introspection", None)  # is set once it is made
     if endpoint.planned.qos is not None:
         options["qos_profile"] = to_rclpy(endpoint.planned.qos)
     if kind is EndpointKind.SERVICE_CLIENT:

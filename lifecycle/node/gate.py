@@ -22,6 +22,7 @@ from lifecycle.measure.counter import Counter
 from lifecycle.measure.sample import Measured, Sample
 
 if TYPE_CHECKING:
+    from rclpy.duration import Duration
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
@@ -402,6 +403,22 @@ class DeclaredPublisher:
     def get_subscription_count(self) -> int:
         """Return how many subscriptions are matched; 0 while not connected."""
         return self._entity.get_subscription_count() if self._entity is not None else 0
+
+    @property
+    def topic_name(self) -> str:
+        """Fully qualified; empty while not connected."""
+        return str(self._entity.topic_name) if self._entity is not None else ""
+
+    def assert_liveliness(self) -> None:
+        """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""
+        if self._entity is not None:
+            self._entity.assert_liveliness()
+
+    def wait_for_all_acked(self, timeout: Duration | None = None) -> bool:
+        """As rclpy's, which blocks: whether all was acknowledged; true while not connected."""
+        if self._entity is None:
+            return True
+        return bool(self._entity.wait_for_all_acked(*(() if timeout is None else (timeout,))))
 
     def attach(self, entity: Publisher) -> None:
         """Publish by `entity` from now on; it is another one than before."""

@@ -147,6 +147,7 @@ class Managed(NodeInHost):
         auto: bool,
         supervisor: str = "",
         *,
+        served: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
         self.turns = Turns(node)
@@ -158,9 +159,11 @@ class Managed(NodeInHost):
         self.data_layer = DataLayer(self)
         self.connections = self.data_layer.connections
         self._machine = Machine(self, spec.timeouts)
-        self._publish = services.serve(node, self._machine, self.turns.group)
-        configuration.serve(node, self.get_configuration, self.turns.group)
-        serve_interface(node, acts_of(self.data_layer), self.turns.group)
+        self._publish: Callable[[Transition], None] = lambda _: None
+        if served:
+            self._publish = services.serve(node, self._machine, self.turns.group)
+            configuration.serve(node, self.get_configuration, self.turns.group)
+            serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
             self._join()
 

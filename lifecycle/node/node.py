@@ -114,6 +114,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             itself as soon as it is spun. Under a supervisor or `lifecycle run` theirs wins.
         namespace: as in rclpy; a manifest's wins.
         context: as in rclpy.
+        enable_communication_interface: serve and announce its states; without, no other process
+            can drive it or read its configuration.
         options: further keywords of rclpy.node.Node.
 
     Attributes:
@@ -134,6 +136,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         lifecycle: str = "manual",
         namespace: str | None = None,
         context: Context | None = None,
+        enable_communication_interface: bool = True,
         **options: Any,
     ) -> None:
         auto = is_auto(lifecycle)
@@ -149,6 +152,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             spec,
             auto,
             by_host.supervisor if by_host is not None else "",
+            served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
         self._gate = self.lifecycle.gate
@@ -260,6 +264,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         name: str,
         msg_type: type[Any],
         qos: QosProfile | QoSProfile | int = 10,
+        *,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
     ) -> None:
         """Declare a publisher; `self.publisher(name)` is its handle from on_configure on.
 
@@ -267,11 +274,15 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             name: relative, absolute or private.
             msg_type: its class.
             qos: a number is a history depth.
+            lossy: see `hint`.
+            size_bytes: see `hint`.
 
         Raises:
             LifecycleError: declared already, or not allowed (any more).
         """
         self._declare(EndpointKind.PUBLISHER, name, msg_type, qos)
+        if (lossy, size_bytes) != (None, None):
+            self.hint(EndpointKind.PUBLISHER.spell(name), lossy=lossy, size_bytes=size_bytes)
 
     def declare_subscription(
         self,
@@ -280,6 +291,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         qos: QosProfile | QoSProfile | int = 10,
         *,
         callback: Callable[..., Any] | None = None,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
     ) -> None:
         """Declare a subscription; a method decorated with `@on_message(name)` receives it.
 
@@ -287,6 +300,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         `declare_publisher`.
         """
         self._declare(EndpointKind.SUBSCRIPTION, name, msg_type, qos, callback=callback)
+        if (lossy, size_bytes) != (None, None):
+            self.hint(EndpointKind.SUBSCRIPTION.spell(name), lossy=lossy, size_bytes=size_bytes)
 
     def declare_service(
         self, name: str, srv_type: type[Any], *, callback: Callable[..., Any] | None = None
@@ -338,14 +353,17 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             size_bytes: the largest serialized message, > 0.
         """
         found = self.lifecycle.data_layer.find(endpoint)
-        found.lossy, found.size_bytes = lossy, size_bytes
+        found.lossy = found.lossy if lossy is None else lossy
+        found.size_bytes = found.size_bytes if size_bytes is None else size_bytes
         self.lifecycle.configuration_changes.touch()
 
     def set_options(self, endpoint: str, **options: Any) -> None:
         """Say how a declared endpoint is made, by further keywords of rclpy's factory of its kind.
 
         In `__init__` or on_configure; they hold each time that it is made: `callback_group`,
-        `event_callbacks`, `raw`. What it cannot have is a TypeError at connect.
+        `event_callbacks`, `raw`; of a service's server or client `introspection`, what it
+        publishes of each call (ServiceIntrospectionState). What it cannot have is a TypeError at
+        connect.
 
         Args:
             endpoint: `video`, or `publishers/video` where another kind has the name too.
@@ -379,12 +397,12 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
 
     # The node interface, in callbacks from on_configure to cleanup.
 
-    def connect_to(self, *urls: str | ConnectionUrl, name: str) -> Connection:
+    def connect_to(self, *urls: str | ConnectionUrl, name: str = "") -> Connection:
         """Make a connection that endpoints can be mapped onto: a DDS participant of its own.
 
         Args:
             urls: its transports, `udpv4://10.77.0.1:7911?peer=10.77.0.2:7910`; at least one.
-            name: letters, digits and underscores.
+            name: letters, digits and underscores; empty makes one up.
 
         Returns:
             The connection; the present one if it has these URLs.

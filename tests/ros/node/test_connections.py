@@ -356,7 +356,7 @@ def test_what_is_asked_wrongly_is_refused_with_what_is_allowed(
     with pytest.raises(NotConfiguredError) as early:
         node.connect_to(UDP, name="net")
     assert str(early.value) == (
-        "cannot connect /it to 'net': it is 'unconfigured'; "
+        f"cannot connect /it to {UDP}: it is 'unconfigured'; "
         "endpoints are declared from configure until cleanup; configure it first"
     )
     assert driver.set("/it", "configure")
@@ -384,7 +384,8 @@ def test_what_is_asked_wrongly_is_refused_with_what_is_allowed(
     assert failed.error.startswith("cannot connect /it to 'net' (upd://127.0.0.1): ")
     node.disconnect("net")  # what could not be made can be forgotten
     assert [each.name for each in node.connections] == [""]
-    made = node.connect_to(UDP, name="connection_1")
+    made = node.connect_to(UDP)
+    assert made.name == "connection_1"
     with pytest.raises(ConnectError) as other:
         node.connect_to(OTHER_UDP, name="connection_1")
     assert str(other.value) == (

@@ -12,6 +12,8 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.service_introspection import ServiceIntrospectionState
+from service_msgs.msg import ServiceEventInfo
 from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
@@ -45,7 +47,10 @@ class Optioned(LifecycleNode):
         )
 
     def on_configure(self) -> None:
-        self.set_options("reset", callback_group=self.slow)
+        self.set_options(
+            "reset", callback_group=self.slow, introspection=ServiceIntrospectionState.CONTENTS
+        )
+        self.set_options("ask", introspection=ServiceIntrospectionState.METADATA)
 
     @on_message("in")
     def receive(self, data: bytes) -> None:
@@ -83,7 +88,11 @@ def test_options_hold_wherever_an_endpoint_is(
     assert node.service("reset").callback_group is node.slow
     peer = make_node("peer")
     driver.executor.add_node(peer)
+    heard: list[ServiceEventInfo] = []
     ears = peer.create_subscription(String, "out", lambda _: None, 10)
+    peer.create_subscription(
+        Trigger.Event, "reset/_service_event", lambda each: heard.append(each.info), 10
+    )
     numbers = peer.create_publisher(Int32, "in", 10)
     asking = peer.create_client(Trigger, "reset")
     driver.spin_until(lambda: node.subscription("in").get_publisher_count() == 1)
@@ -94,7 +103,10 @@ def test_options_hold_wherever_an_endpoint_is(
         numbers.publish(Int32(data=number))
     driver.spin_until(lambda: len(node.got) == 5)
     assert node.got == [3, 4, 5, 6, 7]
-    assert ears.topic_name == node.publisher("out").entity.topic_name
+    asking.call_async(Trigger.Request())
+    driver.spin_until(lambda: len(heard) == 2)
+    assert [each.event_type for each in heard] == [1, 2]
+    assert ears.topic_name == node.publisher("out").topic_name
 
 
 def test_a_declared_publisher_asserts_its_liveliness(
@@ -105,6 +117,7 @@ def test_a_declared_publisher_asserts_its_liveliness(
     )
     node = active(LifecycleNode, publisher("out", qos=qos))
     out = node.publisher("out")
+    assert (out.topic_name, out.wait_for_all_acked()) == ("/out", True)
     alive: list[int] = []
     events = SubscriptionEventCallbacks(liveliness=lambda each: alive.append(each.alive_count))
     wanted = QoSProfile(
@@ -116,7 +129,7 @@ def test_a_declared_publisher_asserts_its_liveliness(
     driver.executor.add_node(peer)
     peer.create_subscription(String, "out", lambda _: None, wanted, event_callbacks=events)
     driver.spin_until(lambda: out.get_subscription_count() == 1)
-    out.entity.assert_liveliness()
+    out.assert_liveliness()
     driver.spin_until(lambda: alive[-1:] == [1])
 
 
