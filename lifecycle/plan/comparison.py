@@ -368,6 +368,11 @@ class PlanChange(msgspec.Struct, frozen=True, kw_only=True):
     restarted: tuple[str, ...] = ()
     parameters: Mapping[str, GivenParameters] = msgspec.field(default_factory=dict)
 
+    @property
+    def ends_or_starts(self) -> bool:
+        """Whether any process ends or is started."""
+        return bool(self.added or self.removed or self.restarted)
+
 
 def change_between(running: Plan, plan: Plan, *, modes: tuple[str, str] = ("", "")) -> PlanChange:
     """Return what has to be done so that a system that runs by one plan runs by the other.

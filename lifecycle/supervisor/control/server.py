@@ -241,7 +241,7 @@ def _check_apply(plan: Plan, system: System) -> None:
             what, "nodes on other machines run by it, too:", difference_lines(found)
         )
     urls = [*_urls(running), *_urls(plan)]
-    if change.differences and any(parse(url).transport.is_tcp for url in urls):
+    if change.ends_or_starts and any(parse(url).transport.is_tcp for url in urls):
         raise _refused_whole(
             what, "a TCP port that was used is not connected to again by who used it"
         )

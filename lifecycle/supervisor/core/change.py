@@ -193,17 +193,18 @@ def _is_down(run: Run, change: Change) -> bool:
 
 
 def _take(run: Run, change: Change) -> None:
-    """Exchange the plan."""
-    plan = change.before if change.back else change.plan
+    """Exchange the plan; what stays is connected as it is."""
+    plan, before = (change.before, change.plan) if change.back else (change.plan, change.before)
     if change.back:
         run.mode, run.revision = change.mode, change.revision
     else:
         run.mode = run.mode_by(plan)
         run.revisions += 1
         run.revision = run.revisions
+    stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
     run.first = plan
     gone = {key: run.nodes.pop(key) for key in change.down & run.nodes.keys()}
-    install(run, in_mode(plan, run.mode))
+    install(run, _connected_as(in_mode(plan, run.mode), stays, before))
     for key in gone.keys() & run.nodes.keys():  # who was kept inactive waits for a person still
         run.nodes[key].withheld, run.nodes[key].refused = gone[key].withheld, gone[key].refused
     for key in change.touched & run.nodes.keys():
@@ -214,6 +215,21 @@ def _take(run: Run, change: Change) -> None:
     run.changed()
     until = Until.VERIFIED if run.paused else Until.ACTIVE
     run.passage = Passage(until_s=change.until_s, until=until)
+
+
+def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:
+    """Return a plan with the connections that running nodes have: a restart may have moved them."""
+    were = {each.key: each for each in before.nodes}
+
+    def connected(node: PlannedNode) -> PlannedNode:
+        was, now = were.get(node.key), stays.get(node.key)
+        if was is None or now is None:
+            return node
+        if (was.connections, was.participants) != (node.connections, node.participants):
+            return node
+        return replace(node, connections=now.connections, participants=now.participants)
+
+    return replace(plan, nodes=tuple(map(connected, plan.nodes)))
 
 
 def _finish(run: Run, change: Change) -> list[Event]:

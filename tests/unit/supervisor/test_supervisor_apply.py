@@ -115,7 +115,14 @@ async def test_what_was_adopted_is_judged_by_another_manifest_and_never_taken_do
     assert not any(line.startswith("/viewer") for line in world.story)
 
 
-async def test_over_tcp_nothing_is_applied(tmp_path: Path) -> None:
+async def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
+    rules = replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     async with active(tmp_path, DIALLING) as world:
+        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+        urls = world.system.plan.node("viewer").connections
         refused = await world.apply(plan_of(*DIALLING.nodes, ARM))
         assert "a TCP port that was used is not connected to again" in refused.error
+        assert _told(await world.apply(rules)) == "0"
+        # It runs where its restart has put it.
+        assert world.system.plan.node("viewer").connections == urls
+        assert urls != rules.node("viewer").connections
