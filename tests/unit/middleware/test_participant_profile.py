@@ -8,14 +8,12 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.discovery import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     ParticipantSettings,
-    check_endpoint,
     default_profile,
     discovery_environment,
     discovery_profile,
@@ -23,7 +21,7 @@ from lifecycle.middleware.fastdds.profiles import (
 )
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.network.ports import participant_ports
-from lifecycle.plan.model import ParticipantConnections, StaticEndpoint
+from lifecycle.plan.model import ParticipantConnections
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -206,47 +204,6 @@ def test_a_profiles_file_that_cannot_be_read_is_named(
     with pytest.raises(MiddlewareError) as refused:
         default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
     assert str(refused.value) == f"cannot read profiles {str(path)!r}: {reason}"
-
-
-_STRING = "std_msgs::msg::dds_::String_"
-
-
-def line(topic: str, user_id: int, *, writer: bool = True, **changes: bool) -> StaticEndpoint:
-    return StaticEndpoint(
-        writer=writer,
-        topic=f"rt{topic}",
-        type=_STRING,
-        profile=topic,
-        user_id=user_id,
-        **changes,
-    )
-
-
-def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
-    lines = [
-        line("/x", 1, writer=False),
-        replace(line("/x", 2), type="std_msgs::msg::dds_::Int32_"),
-        line("/y", 3),
-        line("/x", 4),
-    ]
-    check_endpoint(lines, writer=True, profile="/x", type_name=_STRING)
-    with pytest.raises(MiddlewareError):
-        check_endpoint(lines[:3], writer=True, profile="/x", type_name=_STRING)
-
-
-@pytest.mark.parametrize(
-    ("lines", "listed"),
-    [((line("/x", 1), line("/y", 2, writer=False)), f"/x ({_STRING})"), ((), "none")],
-)
-def test_an_endpoint_that_nobody_would_find_is_refused(
-    lines: tuple[StaticEndpoint, ...], listed: str
-) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        check_endpoint(lines, writer=True, profile="/y", type_name=_STRING)
-    assert str(refused.value) == (
-        f"cannot make a writer of '/y' ({_STRING}): the table of static discovery has only these "
-        f"writers for this participant: {listed}; declare the endpoint, and check or plan again"
-    )
 
 
 def connected(*urls: str, super_client: bool = False) -> ET.Element:
