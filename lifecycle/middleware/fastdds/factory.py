@@ -276,7 +276,7 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
     opened = not own_segments() <= before
     # Of the default context others may have made the participant, with what was there before.
     is_ours = context is not get_default_context() or not before
-    if get_rmw_implementation_identifier() == RMW and (opened or is_ours):
+    if opened or is_ours:
         _SHARED_MEMORY_OF.setdefault(context, opened)
 
 

@@ -120,12 +120,9 @@ def discovery_environment(
     if any(map(os.environ.get, variables)) or Path(version.default_profiles).exists():
         return {}
     path = directory.absolute() / _FILE_NAME
-    # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
-    part = path.with_name(f".{_FILE_NAME}.{os.getpid()}")
     try:
         xml = discovery_profile(peers=peers, multicast_endpoints=multicast_endpoints)
-        part.write_text(xml, encoding="utf-8")
-        part.replace(path)
+        path.write_text(xml, encoding="utf-8")
     except OSError as error:
         raise MiddlewareError(
             f"cannot write the discovery profile {str(path)!r}: {error.strerror}"
