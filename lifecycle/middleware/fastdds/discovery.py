@@ -13,7 +13,7 @@ import ipaddress
 import os
 import shutil
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -190,16 +190,6 @@ def _addresses_of(kind: Medium) -> dict[str, list[str]]:
         if not (address.version == 6 and address.is_link_local):
             found.setdefault(name, []).append(str(address))
     return found
-
-
-def all_by_multicast(
-    machines: Iterable[str], own: Collection[str], environment: Mapping[str, str]
-) -> bool:
-    """Return whether all participants of a system can send their endpoints by multicast.
-
-    So it is on one host, where no other is looked for by its address: routers pass no multicast.
-    """
-    return set(machines) <= set(own) and not environment.get(PEERS_VARIABLE)
 
 
 def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:

@@ -10,7 +10,6 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.discovery import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     ParticipantSettings,
@@ -254,21 +253,6 @@ def test_over_tcp_data_arrive_at_the_port_inside_a_connection_that_discovery_has
 
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-
-
-@pytest.mark.parametrize(
-    ("machines", "own", "environment", "expected"),
-    [
-        (["", ""], {""}, {}, True),
-        (["a", "b"], {"", "a", "b"}, {"ROS_STATIC_PEERS": ""}, True),
-        (["a", "b"], {"a"}, {}, False),
-        ([""], {""}, {"ROS_STATIC_PEERS": "10.0.2.1"}, False),
-    ],
-)
-def test_endpoints_go_by_multicast_only_where_no_other_host_is_looked_for(
-    machines: list[str], own: set[str], environment: dict[str, str], *, expected: bool
-) -> None:
-    assert all_by_multicast(machines, own, environment) is expected
 
 
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
