@@ -288,14 +288,8 @@ _PROGRAM = "fast-discovery-server"
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 
 
-def discovery_server_command(
-    server: PlannedServer, environment: Mapping[str, str] | None = None
-) -> tuple[tuple[str, ...], dict[str, str]]:
+def discovery_server_command(server: PlannedServer) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return the command line of a discovery server on this host, and its whole environment.
-
-    Args:
-        server: address, port and transport.
-        environment: what it otherwise gets; None for this process's.
 
     Raises:
         MiddlewareError: the program is not installed.
@@ -303,7 +297,7 @@ def discovery_server_command(
     options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
     command = (_program(), *installed().server_arguments)
     argv = (*command, "-i", "0", *options, str(server.port))  # the id that clients expect
-    current = dict(os.environ if environment is None else environment)
+    current = dict(os.environ)
     # A profile or a server of the environment's would be applied to the server itself.
     for variable in (
         *(each.profiles_variable for each in DISTRIBUTIONS),
