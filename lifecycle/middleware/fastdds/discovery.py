@@ -13,7 +13,7 @@ import ipaddress
 import os
 import shutil
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -192,16 +192,6 @@ def _addresses_of(kind: Medium) -> dict[str, list[str]]:
     return found
 
 
-def all_by_multicast(
-    machines: Iterable[str], own: Collection[str], environment: Mapping[str, str]
-) -> bool:
-    """Return whether all participants of a system can send their endpoints by multicast.
-
-    So it is on one host, where no other is looked for by its address: routers pass no multicast.
-    """
-    return set(machines) <= set(own) and not environment.get(PEERS_VARIABLE)
-
-
 def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
     """Return whether a participant of these URLs finds others by a discovery server."""
     if any(url.server for url in urls) or environment.get(DISCOVERY_SERVER_VARIABLE):
@@ -298,14 +288,8 @@ _PROGRAM = "fast-discovery-server"
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
 
 
-def discovery_server_command(
-    server: PlannedServer, environment: Mapping[str, str] | None = None
-) -> tuple[tuple[str, ...], dict[str, str]]:
+def discovery_server_command(server: PlannedServer) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return the command line of a discovery server on this host, and its whole environment.
-
-    Args:
-        server: address, port and transport.
-        environment: what it otherwise gets; None for this process's.
 
     Raises:
         MiddlewareError: the program is not installed.
@@ -313,7 +297,7 @@ def discovery_server_command(
     options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
     command = (_program(), *installed().server_arguments)
     argv = (*command, "-i", "0", *options, str(server.port))  # the id that clients expect
-    current = dict(os.environ if environment is None else environment)
+    current = dict(os.environ)
     # A profile or a server of the environment's would be applied to the server itself.
     for variable in (
         *(each.profiles_variable for each in DISTRIBUTIONS),

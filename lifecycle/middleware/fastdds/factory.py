@@ -49,7 +49,7 @@ from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.versions import INSTALL, KNOWN_FAST_DDS, installed
 from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan.model import PlannedNode, StaticEndpoint
+from lifecycle.plan.model import PlannedNode, PlannedParticipant, StaticEndpoint
 
 RMW = "rmw_fastrtps_cpp"
 
@@ -153,41 +153,6 @@ def _fast_dds_refusal() -> str:
     return ""
 
 
-@contextlib.contextmanager
-def _default_participant(xml: str) -> Iterator[None]:
-    """Have participants that are created inside the block made from a profile.
-
-    One block at a time: other threads that use this function wait; participants that they create
-    otherwise meanwhile get this profile too.
-
-    Args:
-        xml: the profile, with _DRAFT for its name. Fast DDS keeps each for good, so equal ones are
-            loaded once.
-
-    Raises:
-        MiddlewareError: Fast DDS refused it, which it explains on standard error.
-    """
-    dds = _library()
-    name = f"lifecycle_{hashlib.sha256(xml.encode()).hexdigest()[:16]}"
-    data = name.encode()
-    text = _String(data=data, size=len(data), capacity=len(data))
-    with dds.lock, dds.copied_default() as before, dds.copied_default() as wanted:
-        result = _OK if name in dds.loaded else dds.load(xml.replace(_DRAFT, name))
-        if result == _OK:
-            dds.loaded.add(name)
-            result = dds.qos_from_profile(dds.factory(), ctypes.byref(text), wanted)
-        if result == _OK:
-            result = dds.set_default_qos(dds.factory(), wanted)
-        if result != _OK:
-            raise MiddlewareError(
-                f"cannot use participant profile {name!r}: Fast DDS refused it (code {result})"
-            )
-        try:
-            yield
-        finally:
-            dds.set_default_qos(dds.factory(), before)
-
-
 def _load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
     """Have these endpoints made with the ids of their lines in the table of static discovery.
 
@@ -221,10 +186,6 @@ def _load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
         dds.static.update(((each.writer, each.profile), each.user_id) for each in new)
 
 
-_LOCALHOST_ONLY = "ROS_LOCALHOST_ONLY"
-"""ROS 2 of before Jazzy has that for a range of LOCALHOST, and it counts first."""
-
-
 def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
@@ -246,31 +207,36 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
 
 def _localhost_peers() -> tuple[str, ...] | None:
     """Return the static peers where the environment asks for LOCALHOST; None if it does not."""
-    if os.environ.get(_LOCALHOST_ONLY) == "1":
-        return ()
     if os.environ.get(RANGE_VARIABLE) != "LOCALHOST":
         return None
     return tuple(filter(None, os.environ.get(PEERS_VARIABLE, "").split(";")))
 
 
-@contextlib.contextmanager
-def discovery_by_profile(settings: ParticipantSettings) -> Iterator[None]:
-    """Have rmw leave discovery to the profile of a context that is initialised in the block.
+def initialised(
+    settings: ParticipantSettings,
+    domain_id: int | None,
+    *,
+    context: Context | None = None,
+    args: Sequence[str] = (),
+    **options: Any,
+) -> Context:
+    """Initialise a context whose participant is to have these settings, by default the process's.
 
-    rcl reads the range from the environment then (rcl/discovery_options.h). What `settings` leave
-    open stays as it is.
+    rcl reads the range from the environment then (rcl/discovery_options.h): rmw leaves discovery to
+    the participant's profile where that says all. Other options are those of rclpy's `init`.
     """
-    is_left = settings.chooses_transports and _localhost_peers() is not None
-    if not (settings.governs_discovery or is_left):
-        yield
-        return
-    before = {each: os.environ.pop(each, None) for each in (RANGE_VARIABLE, _LOCALHOST_ONLY)}
-    os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
+    made = context or get_default_context()
+    before = os.environ.get(RANGE_VARIABLE)
+    is_left = settings.chooses_transports and before == "LOCALHOST"
+    if settings.governs_discovery or is_left:
+        os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
     try:
-        yield
+        made.init(args=[*args], domain_id=domain_id, **options)
     finally:
-        del os.environ[RANGE_VARIABLE]
-        os.environ.update({name: value for name, value in before.items() if value is not None})
+        os.environ.pop(RANGE_VARIABLE, None)
+        if before is not None:
+            os.environ[RANGE_VARIABLE] = before
+    return made
 
 
 _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDictionary()
@@ -294,7 +260,7 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
     change nothing, and need no Fast DDS.
 
     Args:
-        context: initialised in `discovery_by_profile`; without effect if it has a node already.
+        context: made by `initialised`; without effect if it has a node already.
         settings: of the participant.
 
     Raises:
@@ -310,12 +276,18 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
     opened = not own_segments() <= before
     # Of the default context others may have made the participant, with what was there before.
     is_ours = context is not get_default_context() or not before
-    if get_rmw_implementation_identifier() == RMW and (opened or is_ours):
+    if opened or is_ours:
         _SHARED_MEMORY_OF.setdefault(context, opened)
 
 
 @contextlib.contextmanager
 def _applied(context: Context, settings: ParticipantSettings) -> Iterator[None]:
+    """Have participants that are created inside the block made from a profile.
+
+    One block at a time: other threads that use this function wait; participants that they create
+    otherwise meanwhile get this profile too. Fast DDS keeps each profile for good, so equal ones
+    are loaded once.
+    """
     rmw = get_rmw_implementation_identifier()
     if rmw != RMW:
         raise MiddlewareError(
@@ -341,10 +313,27 @@ def _applied(context: Context, settings: ParticipantSettings) -> Iterator[None]:
         localhost_peers=_localhost_peers() if is_open else None,
         domain_id=context.get_domain_id(),
     )
-    with _default_participant(xml):
-        # Under its lock: no other participant of ours is made in between.
+    dds = _library()
+    name = f"lifecycle_{hashlib.sha256(xml.encode()).hexdigest()[:16]}"
+    data = name.encode()
+    text = _String(data=data, size=len(data), capacity=len(data))
+    with dds.lock, dds.copied_default() as before, dds.copied_default() as wanted:
+        # Under the lock: no other participant of ours is made in between.
         check_free(settings.urls)
-        yield
+        result = _OK if name in dds.loaded else dds.load(xml.replace(_DRAFT, name))
+        if result == _OK:
+            dds.loaded.add(name)
+            result = dds.qos_from_profile(dds.factory(), ctypes.byref(text), wanted)
+        if result == _OK:
+            result = dds.set_default_qos(dds.factory(), wanted)
+        if result != _OK:
+            raise MiddlewareError(
+                f"cannot use participant profile {name!r}: Fast DDS refused it (code {result})"
+            )
+        try:
+            yield
+        finally:
+            dds.set_default_qos(dds.factory(), before)
 
 
 def unknown_versions() -> str:
@@ -375,18 +364,11 @@ def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
                     f"{node.key!r} a flow of its own ('unique: strictly_required'): {rcl}",
                     hint=f"use 'unique: optionally_required', or {INSTALL}",
                 )
-        for key in _chosen(node) if fast_dds else ():
-            raise MiddlewareError(
-                f"{node.at.spelled}: cannot make a participant of {node.key!r} with {key}: "
-                f"{fast_dds}",
-                hint=INSTALL,
-            )
-
-
-def _chosen(node: PlannedNode) -> Iterator[str]:
-    """Yield the keys for which rmw_fastrtps alone cannot make the participants of a node."""
-    if ParticipantSettings.of(node):
-        yield "'connections', 'transport' or 'discovery' as declared"
-    for each in node.participants:
-        if ParticipantSettings.of(each):
-            yield f"'transport' or 'connections' as declared ({each.reason})"
+        carrying: list[PlannedNode | PlannedParticipant] = [node, *node.participants]
+        for made in carrying if fast_dds else ():
+            if ParticipantSettings.of(made):
+                raise MiddlewareError(
+                    f"{node.at.spelled}: cannot make a participant of {node.key!r} with "
+                    f"'connections', 'transport' or 'discovery' as declared: {fast_dds}",
+                    hint=INSTALL,
+                )

@@ -29,7 +29,6 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.conversions import to_rclpy
 from lifecycle.middleware.versions import INSTALL, private
@@ -52,9 +51,6 @@ SHARED_MEMORY = NetworkFlowEndpoint(
     transport_port=0,
 )
 """The NFE of shared memory; a subscription's has the number of a Fast DDS port on top."""
-
-_UNIQUE_PORTS = range(7000, 7400)
-"""Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
 
 
 def get_network_flow_endpoints(entity: Publisher | Subscription) -> tuple[NetworkFlowEndpoint, ...]:
@@ -172,7 +168,8 @@ def create_subscription(
     try:
         if refusal := _made_unique(handle, node, type_, topic, unique):
             raise MiddlewareError(  # noqa: TRY301 - after which nothing is left
-                f"{what}: {refusal}", hint=_subscription_hint()
+                f"{what}: {refusal}",
+                hint=f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}",
             )
         subscription = Subscription(
             *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
@@ -210,15 +207,3 @@ def _made_unique(
         # The article defines network flows for UDP and TCP over IP only.
         return "the RMW lists only shared memory for it, which is no network flow"
     return ""
-
-
-def _subscription_hint() -> str:
-    """Say so when the host's unique ports are used up: rcl's own reason does not."""
-    taken = {each.port for each in udp_sockets()}
-    if not taken.issuperset(_UNIQUE_PORTS):
-        return f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}"
-    return (
-        f"all {len(_UNIQUE_PORTS)} ports {_UNIQUE_PORTS[0]}–{_UNIQUE_PORTS[-1]} of this host are "
-        "taken; Fast DDS frees one only when the participant that used it ends: restart the "
-        "processes whose nodes were disconnected and connected again"
-    )

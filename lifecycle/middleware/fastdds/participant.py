@@ -35,8 +35,8 @@ from rclpy.waitable import Waitable
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
-from lifecycle.middleware.fastdds.factory import discovery_by_profile, participant_settings
-from lifecycle.middleware.fastdds.profiles import ParticipantSettings, check_endpoint
+from lifecycle.middleware.fastdds.factory import initialised, participant_settings
+from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.conversions import to_rclpy
@@ -68,8 +68,7 @@ def quiet_node(
     context = rclpy.Context()
     node: Node | None = None
     try:
-        with discovery_by_profile(settings):
-            context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
+        initialised(settings, domain_id, context=context, args=enclave, initialize_logging=False)
         with participant_settings(context, settings):
             node = Node(name, namespace=namespace, context=context, **_QUIET)
     except Exception as error:
@@ -241,7 +240,6 @@ class FlowParticipant:
         Its events are handled where the node served is spun; without `event_callbacks` none are set
         up. Options are those of rclpy's `create_publisher`.
         """
-        self._check_static(type_, topic, writer=True)
         if not options.get("event_callbacks"):
             options["event_callbacks"] = PublisherEventCallbacks(use_default_callbacks=False)
         publisher = self.node.create_publisher(type_, topic, to_rclpy(qos), **options)
@@ -261,7 +259,6 @@ class FlowParticipant:
         **options: Any,
     ) -> Subscription:
         """Create a subscription on this participant; arguments as `nfe.create_subscription`."""
-        self._check_static(type_, topic, writer=False)
         if callback_group is None and self._served is not None:
             callback_group = self._served.default_callback_group
         subscription = nfe.create_subscription(
@@ -331,18 +328,6 @@ class FlowParticipant:
         if self._served is not None:
             _move(entity, self.node, self._served)
             self._moved.append(entity)
-
-    def _check_static(self, type_: type[Any], topic: str, *, writer: bool) -> None:
-        """Refuse an endpoint that the table of static discovery does not have, if there is one."""
-        if not self.settings.static_endpoints:
-            return
-        package, kind = type_.__module__.split(".")[:2]
-        check_endpoint(
-            self.settings.static_endpoints,
-            writer=writer,
-            profile=self.node.resolve_topic_name(topic),
-            type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
-        )
 
     def __enter__(self) -> FlowParticipant:
         return self

@@ -26,7 +26,7 @@ from collections.abc import Iterable, Sequence
 
 from lifecycle.middleware.fastdds.discovery import SETTLE_S, Reach, Target
 from lifecycle.middleware.fastdds.profiles import PARTICIPANT_LEASE_S
-from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets
+from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets_of_others
 from lifecycle.middleware.process.process_table import PROCESS_DIGITS, is_of_host
 
 ANSWER_S = 0.15
@@ -197,7 +197,7 @@ class Prober:
             return frozenset()
         return frozenset(
             each
-            for each in udp_sockets(of_others=True)
+            for each in udp_sockets_of_others()
             if (at := asked.get(each.port))
             and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
         )

@@ -120,12 +120,9 @@ def discovery_environment(
     if any(map(os.environ.get, variables)) or Path(version.default_profiles).exists():
         return {}
     path = directory.absolute() / _FILE_NAME
-    # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
-    part = path.with_name(f".{_FILE_NAME}.{os.getpid()}")
     try:
         xml = discovery_profile(peers=peers, multicast_endpoints=multicast_endpoints)
-        part.write_text(xml, encoding="utf-8")
-        part.replace(path)
+        path.write_text(xml, encoding="utf-8")
     except OSError as error:
         raise MiddlewareError(
             f"cannot write the discovery profile {str(path)!r}: {error.strerror}"
@@ -406,29 +403,3 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
         element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
         put(element, "userDefinedID", endpoint.user_id)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
-
-
-def check_endpoint(
-    endpoints: Sequence[StaticEndpoint], *, writer: bool, profile: str, type_name: str
-) -> None:
-    """Refuse an endpoint that is about to be made and that no participant would ever find.
-
-    Args:
-        endpoints: the participant's lines in the table.
-        writer: a writer, else a reader.
-        profile: the fully qualified topic name.
-        type_name: DDS name of its type.
-
-    Raises:
-        MiddlewareError: the table does not have it.
-    """
-    same_end = [each for each in endpoints if each.writer is writer]
-    if any((each.profile, each.type) == (profile, type_name) for each in same_end):
-        return
-    what = "writers" if writer else "readers"
-    listed = ", ".join(f"{each.profile} ({each.type})" for each in same_end)
-    raise MiddlewareError(
-        f"cannot make a {what[:-1]} of {profile!r} ({type_name}): the table of static discovery "
-        f"has only these {what} for this participant: {listed or 'none'}",
-        hint="declare the endpoint, and check or plan again",
-    )

@@ -108,15 +108,13 @@ def _bound_here() -> Iterator[tuple[socket.socket, OpenSocket]]:
             yield each, OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)
 
 
-def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
-    """Return the UDP sockets of our network namespace, or only those that others have."""
-    ours = {each.inode for each in open_sockets()} if of_others else set[int]()
-    found: list[OpenSocket] = []
+def udp_sockets_of_others() -> Iterator[OpenSocket]:
+    """Yield the UDP sockets of our network namespace that other processes have."""
+    ours = {each.inode for each in open_sockets()}
     for kind in UDP_UNICAST:
         table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
         with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
-            found += [each for each, _ in sockets_in(table, kind) if each.inode not in ours]
-    return tuple(found)
+            yield from (each for each, _ in sockets_in(table, kind) if each.inode not in ours)
 
 
 def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str], ...]:
@@ -218,24 +216,20 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     return {each.getsockopt(*DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
-def widen_discovery_buffers(domain_id: int) -> int:
+def widen_discovery_buffers(domain_id: int) -> None:
     """Give the sockets on which this process receives discovery room for many participants.
 
     Fast DDS 2.14 leaves them the system's default, which holds a quarter of what twenty
-    participants announce. Data keep their buffers: what waits in a large one is late. Returns how
-    many have more room than before.
+    participants announce. Data keep their buffers: what waits in a large one is late.
     """
     first = participant_ports(domain_id, 0).discovery_multicast
     ports = range(first, first + DG, 2)
-    count = 0
     for each in sockets_here():
         if each.type != socket.SOCK_DGRAM or each.family not in DSCP_OPTION:
             continue
         before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
             each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
-            count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
-    return count
 
 
 def _address(text: str) -> str:
@@ -282,18 +276,15 @@ _ESTABLISHED = 1
 _STATE, _RETRANSMITS, _PROBES = 0, 2, 3  # offsets in struct tcp_info
 
 
-def give_up_dead_connections() -> int:
-    """Shut down every TCP connection of this process that is not answered; return how many.
+def give_up_dead_connections() -> None:
+    """Shut down every TCP connection of this process that is not answered.
 
     For a process that is about to end: an accepted connection that is shut down is not made again.
     """
-    count = 0
     for each in _connections():
         with contextlib.suppress(OSError):  # closed since
             if _is_dead(each):
                 each.shutdown(socket.SHUT_RDWR)
-                count += 1
-    return count
 
 
 def _connections() -> Iterator[socket.socket]:
@@ -320,15 +311,12 @@ and would give up after 15 s. Fast DDS 2.14 does not get over a connection that 
 _TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
 
 
-def send_again_soon() -> int:
+def send_again_soon() -> None:
     """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
 
-    Returns how many heed it: 0 before Linux 6.15, which has no such option.
+    Without effect before Linux 6.15, which has no such option.
     """
-    count = 0
     for each in _connections():
         with contextlib.suppress(OSError):  # closed since, or a kernel without the option
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
             each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))
-            count += 1
-    return count

@@ -10,7 +10,7 @@ DDS would send everything twice.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -29,7 +29,7 @@ DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1
 _TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 """What a profile calls the transports."""
 
-_UNICAST, _GROUPS = _DATA = ("defaultUnicastLocatorList", "defaultMulticastLocatorList")
+_DATA = ("defaultUnicastLocatorList", "defaultMulticastLocatorList")
 _DISCOVERY_UNICAST, _DISCOVERY_GROUPS, _SEARCHED = _DISCOVERY = (
     "metatrafficUnicastLocatorList",
     "metatrafficMulticastLocatorList",
@@ -119,18 +119,19 @@ def add_transports(
         localhost_peers: see `participant_profile.profile`.
     """
     urls = [url for family in found for url in family.urls]
+    udp = [family for family in found if family.kind.is_udp]
+    tcp = [family for family in found if family.kind.is_tcp]
     builtin = child(rtps, "builtin")
-    lists = {tag: ET.Element(tag) for tag in (*_DATA, *_DISCOVERY)}
+    searched: list[ET.Element] = []
     if urls:
         drop(rtps, *_DATA)
         drop(builtin, *_DISCOVERY, "avoid_builtin_multicast", "mutation_tries")
     elif localhost_peers is not None:
         # As rmw_fastrtps's create_participant does: it adds to what a profile of the user's has.
-        lists[_SEARCHED].extend(builtin.findall(f"{_SEARCHED}/locator"))
+        searched += builtin.findall(f"{_SEARCHED}/locator")
         drop(builtin, *_DISCOVERY)
     descriptors = ET.SubElement(profiles, "transport_descriptors")
     chosen = ET.SubElement(rtps, "userTransports")
-    logical = participant_ports(domain_id, 0).discovery_unicast
     for family in found:
         made = _described(family, is_local=localhost_peers is not None)
         if family.kind.is_udp and non_blocking_send:
@@ -138,23 +139,49 @@ def add_transports(
         put(made, "transport_id", f"{name}_{family.kind}")
         descriptors.append(made)
         ET.SubElement(chosen, "transport_id").text = f"{name}_{family.kind}"
-        _list_locators(lists, family, logical, localhost_peers)
+        searched += _looked_for(family, localhost_peers)
     put(rtps, "useBuiltinTransports", "false")
-    is_network = all(family.kind.is_network for family in found)
-    has_tcp = any(family.kind.is_tcp for family in found)
-    if any(url.port and url.transport.is_udp for url in urls) or (has_tcp and is_network):
+    # Over TCP data arrive at discovery's port inside a connection: Fast DDS may lose the request
+    # for another one, and who was discovered over TCP is then reached by data, too.
+    logical = participant_ports(domain_id, 0).discovery_unicast
+    inside = [
+        _locator(each.kind, url.address, physical=url.port, port=logical)
+        for each in tcp
+        for url in each.urls
+    ]
+    is_network = len(tcp) + len(udp) == len(found)
+    if any(url.port and url.transport.is_udp for url in urls) or (tcp and is_network):
         # Some of it is fixed: then Fast DDS adds nothing by itself.
-        rtps.extend(each for tag in _DATA if len(each := lists[tag]))
+        groups = [url for url in urls if url.transport.is_group]
+        _list(rtps, _DATA[0], [*inside, *(at for each in udp for at in _own(each))])
+        _list(rtps, _DATA[1], [_locator(url.family, url.address, port=url.port) for url in groups])
     multicast = localhost_peers is None and all(url.multicast for url in urls)
     if any(url.server for url in urls):
         _add_servers(child(builtin, "discovery_config"), urls)
-        lists[_SEARCHED].clear()
-        multicast = False
+        searched, multicast = [], False
     elif not multicast and localhost_peers is None:
         put(builtin, "avoid_builtin_multicast", "true")
-    _add_discovery(builtin, found, lists, multicast=multicast)
+    groups_of_all = [_locator(each.kind, DISCOVERY_GROUP[each.kind]) for each in udp if multicast]
+    is_fixed = any(family.option("metatraffic_port") for family in udp)
+    if is_fixed or len(tcp) == len(found) or (udp and not multicast):
+        # Fast DDS would not do as asked by itself.
+        heard = [*inside, *(at for each in udp for at in _own(each, of_discovery=True))]
+        _list(builtin, _DISCOVERY_UNICAST, heard)
+        _list(builtin, _DISCOVERY_GROUPS, groups_of_all)
+    if searched:
+        # Named peers replace the groups by which Fast DDS otherwise announces.
+        _list(builtin, _SEARCHED, [*searched, *groups_of_all])
+    if all(map(_has_fixed_ports, found)):
+        # Else Fast DDS would take other ports for busy ones, and no peer would look there.
+        put(builtin, "mutation_tries", 0)
     if not len(builtin):
         rtps.remove(builtin)
+
+
+def _has_fixed_ports(family: UrlTransport) -> bool:
+    ports = [url.port for url in family.urls if not url.transport.is_group]
+    is_fixed = family.kind.is_udp and family.option("metatraffic_port")
+    return bool(is_fixed and ports) and all(ports)
 
 
 def _described(family: UrlTransport, *, is_local: bool) -> ET.Element:
@@ -185,86 +212,53 @@ def _described(family: UrlTransport, *, is_local: bool) -> ET.Element:
     return made
 
 
-def _list_locators(
-    lists: Mapping[str, ET.Element],
-    family: UrlTransport,
-    logical: int,
-    localhost_peers: tuple[str, ...] | None,
-) -> None:
-    """List where a transport's data and discovery arrive, and where others are looked for.
+def _own(family: UrlTransport, *, of_discovery: bool = False) -> Iterator[ET.Element]:
+    """Yield where data, or discovery, arrive over UDP.
 
-    TCP's data arrive at discovery's port inside a connection, `logical`: Fast DDS may lose the
-    request for another one, and who was discovered over TCP is then reached by data, too.
+    Readers of a group also need an address of their own: one that is alone is sent to there, and
+    what a reliable writer repeats. A locator without address and port means "any" and keeps
+    multicast from being added.
     """
-    kind = family.kind
-    if kind.is_tcp:
-        for url in family.urls:
-            for tag in (_UNICAST, _DISCOVERY_UNICAST):
-                _locate(lists[tag], kind, url.address, physical=url.port, port=logical)
-        for peer in family.peers:
-            _locate(lists[_SEARCHED], kind, peer.address, physical=peer.port)
-    if not kind.is_udp:
-        return
     own = [url for url in family.urls if not url.transport.is_group]
-    # Readers of a group also need an address of their own: one that is alone is sent to there, and
-    # what a reliable writer repeats.
-    for address, port in [(url.address, url.port) for url in own] or [("", None)]:
-        _locate(lists[_UNICAST], kind, address, port=port)
-    for url in family.urls:
-        if url.transport.is_group:
-            _locate(lists[_GROUPS], kind, url.address, port=url.port)
-    # A locator without address and port means "any" and keeps multicast from being added.
-    for address in dict.fromkeys(url.address for url in own) or ("",):
-        _locate(lists[_DISCOVERY_UNICAST], kind, address, port=family.option("metatraffic_port"))
-    _locate(lists[_DISCOVERY_GROUPS], kind, DISCOVERY_GROUP[kind])
+    port = family.option("metatraffic_port")
+    at = [(url.address, port if of_discovery else url.port) for url in own]
+    for address, number in dict.fromkeys(at) or [("", port if of_discovery else None)]:
+        yield _locator(family.kind, address, port=number)
+
+
+def _looked_for(
+    family: UrlTransport, localhost_peers: tuple[str, ...] | None
+) -> Iterator[ET.Element]:
+    """Yield where others are looked for by a transport."""
+    kind = family.kind
     for peer in family.peers:
-        _locate(lists[_SEARCHED], kind, peer.address, port=peer.port)
-    for address in () if localhost_peers is None else (*localhost_peers, kind.loopback):
+        if kind.is_tcp:
+            yield _locator(kind, peer.address, physical=peer.port)
+        else:
+            yield _locator(kind, peer.address, port=peer.port)
+    if localhost_peers is None or not kind.is_udp:
+        return
+    for address in (*localhost_peers, kind.loopback):
         parsed = parse_address(address)  # None of a name, which may be of any family
         if parsed is None or parsed.version == kind.ip_version:
-            _locate(lists[_SEARCHED], kind, address)
+            yield _locator(kind, address)
 
 
-def _locate(
-    locators: ET.Element,
-    kind: Medium,
-    address: str,
-    *,
-    port: int | None = None,
-    physical: int | None = None,
-) -> None:
-    """Add a locator; no address is any, no port the well-known one, of TCP the one inside."""
-    element = ET.SubElement(ET.SubElement(locators, "locator"), kind.value)
+def _locator(
+    kind: Medium, address: str, *, port: int | None = None, physical: int | None = None
+) -> ET.Element:
+    """Return a locator; no address is any, no port the well-known one, of TCP the one inside."""
+    locator = ET.Element("locator")
+    element = ET.SubElement(locator, kind.value)
     for tag, value in (("address", address), ("physical_port", physical), ("port", port)):
         if value:
             put(element, tag, value)
+    return locator
 
 
-def _add_discovery(
-    builtin: ET.Element,
-    found: Sequence[UrlTransport],
-    lists: Mapping[str, ET.Element],
-    *,
-    multicast: bool,
-) -> None:
-    """Say where discovery arrives, if Fast DDS would not do as asked by itself, and goes to."""
-    udp = [family for family in found if family.kind.is_udp]
-    is_fixed = any(family.option("metatraffic_port") for family in udp)
-    if is_fixed or all(family.kind.is_tcp for family in found) or (udp and not multicast):
-        builtin.append(lists[_DISCOVERY_UNICAST])
-        if udp and multicast:  # an empty list would be refused
-            builtin.append(lists[_DISCOVERY_GROUPS])
-    if len(searched := lists[_SEARCHED]):
-        if multicast:
-            # Named peers replace the groups by which Fast DDS otherwise announces.
-            searched.extend(lists[_DISCOVERY_GROUPS])
-        builtin.append(searched)
-    for family in found:
-        ports = [url.port for url in family.urls if not url.transport.is_group]
-        if not (family.kind.is_udp and family.option("metatraffic_port") and ports and all(ports)):
-            return
-    # Else Fast DDS would take other ports for busy ones, and no peer would look there.
-    put(builtin, "mutation_tries", 0)
+def _list(parent: ET.Element, tag: str, locators: Sequence[ET.Element]) -> None:
+    if locators:  # an empty list would be refused
+        ET.SubElement(parent, tag).extend(locators)
 
 
 def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
@@ -281,7 +275,8 @@ def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
                 listened = child(remote, "metatrafficUnicastLocatorList")
             # A server's logical port is its physical one.
             physical = server.port if url.transport.is_tcp else None
-            _locate(listened, url.family, server.address, port=server.port, physical=physical)
+            at = _locator(url.family, server.address, port=server.port, physical=physical)
+            listened.append(at)
 
 
 def child(parent: ET.Element, tag: str) -> ET.Element:

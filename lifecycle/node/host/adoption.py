@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.utilities import get_default_context
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.discovery import reach
-from lifecycle.middleware.fastdds.factory import discovery_by_profile
+from lifecycle.middleware.fastdds.factory import initialised
 from lifecycle.middleware.fastdds.participant import made_participant
 from lifecycle.middleware.fastdds.prober import Prober
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
@@ -49,20 +48,6 @@ _FACTORIES = {
 }
 """What each makes, and its positional parameters where it can be made with a flow of its own."""
 _REMOVERS = ("destroy_publisher", "destroy_subscription", "destroy_service", "destroy_client")
-
-
-def initialised(
-    settings: ParticipantSettings,
-    domain_id: int | None,
-    *,
-    args: list[str] | None = None,
-    context: Context | None = None,
-) -> Context:
-    """Initialise a context, by default that of the process, without signal handlers of rclpy's."""
-    made = context or get_default_context()
-    with discovery_by_profile(settings):
-        made.init(args=args or [], domain_id=domain_id)
-    return made
 
 
 class Participants:

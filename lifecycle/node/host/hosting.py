@@ -23,12 +23,13 @@ from rclpy.context import Context
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.measure.sample import SLOT_S
+from lifecycle.middleware.fastdds.factory import initialised
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import send_again_soon
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.control import leave_and_exit
 from lifecycle.node.callbacks import SUCCESS, CallbackOutcome, Result
-from lifecycle.node.host.adoption import Adoption, Hosted, initialised, maker_of
+from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
 from lifecycle.node.host.control import (
     Command,
     Event,

@@ -16,10 +16,11 @@ from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.middleware.fastdds.factory import initialised
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.middleware.rcl.conversions import import_interface, to_rclpy
 from lifecycle.node.callbacks import CallbackOutcome, Result
-from lifecycle.node.host.adoption import Adoption, initialised, maker_of
+from lifecycle.node.host.adoption import Adoption, maker_of
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.host.loop import NodeLoop
 from lifecycle.plan.model import PlannedNode

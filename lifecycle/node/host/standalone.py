@@ -11,9 +11,10 @@ from typing import Any, NoReturn
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind
+from lifecycle.middleware.fastdds.factory import initialised
 from lifecycle.middleware.fastdds.profiles import ParticipantSettings
 from lifecycle.node.callbacks import CallbackOutcome
-from lifecycle.node.host.adoption import Adoption, Hosted, initialised
+from lifecycle.node.host.adoption import Adoption, Hosted
 from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.managed import Managed
 from lifecycle.node.planned import is_auto

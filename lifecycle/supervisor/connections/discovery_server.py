@@ -63,7 +63,7 @@ async def begin(system: System, spawner: ForkServer) -> None:
             "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'"
         )
     try:
-        argv, environment = discovery_server_command(planned, {**os.environ})
+        argv, environment = discovery_server_command(planned)
     except MiddlewareError as error:
         raise _failed(error.message) from error
     # What it must not have would be inherited: `env` takes it away and becomes the program.

@@ -20,7 +20,6 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.fastdds.discovery import (
-    all_by_multicast,
     discovery_peers,
     peers_environment,
 )
@@ -350,7 +349,10 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     hosts = reached_hosts(plan, own)
     os.environ.update(peers_environment(hosts, os.environ))
     peers = discovery_peers(plan.domain_id, hosts, os.environ)
-    multicast = all_by_multicast((each.machine for each in plan.nodes), own, os.environ)
+    # Routers pass no multicast: all must be here, and no other host be looked for by its address.
+    multicast = {each.machine for each in plan.nodes} <= set(own) and not os.environ.get(
+        PEERS_VARIABLE
+    )
     os.environ.update(
         discovery_environment(directory.path, peers=peers, multicast_endpoints=multicast)
     )

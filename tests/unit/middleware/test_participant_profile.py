@@ -8,14 +8,11 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.discovery import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     ParticipantSettings,
-    check_endpoint,
     default_profile,
     discovery_environment,
     discovery_profile,
@@ -23,7 +20,7 @@ from lifecycle.middleware.fastdds.profiles import (
 )
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.network.ports import participant_ports
-from lifecycle.plan.model import ParticipantConnections, StaticEndpoint
+from lifecycle.plan.model import ParticipantConnections
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -208,47 +205,6 @@ def test_a_profiles_file_that_cannot_be_read_is_named(
     assert str(refused.value) == f"cannot read profiles {str(path)!r}: {reason}"
 
 
-_STRING = "std_msgs::msg::dds_::String_"
-
-
-def line(topic: str, user_id: int, *, writer: bool = True, **changes: bool) -> StaticEndpoint:
-    return StaticEndpoint(
-        writer=writer,
-        topic=f"rt{topic}",
-        type=_STRING,
-        profile=topic,
-        user_id=user_id,
-        **changes,
-    )
-
-
-def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
-    lines = [
-        line("/x", 1, writer=False),
-        replace(line("/x", 2), type="std_msgs::msg::dds_::Int32_"),
-        line("/y", 3),
-        line("/x", 4),
-    ]
-    check_endpoint(lines, writer=True, profile="/x", type_name=_STRING)
-    with pytest.raises(MiddlewareError):
-        check_endpoint(lines[:3], writer=True, profile="/x", type_name=_STRING)
-
-
-@pytest.mark.parametrize(
-    ("lines", "listed"),
-    [((line("/x", 1), line("/y", 2, writer=False)), f"/x ({_STRING})"), ((), "none")],
-)
-def test_an_endpoint_that_nobody_would_find_is_refused(
-    lines: tuple[StaticEndpoint, ...], listed: str
-) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        check_endpoint(lines, writer=True, profile="/y", type_name=_STRING)
-    assert str(refused.value) == (
-        f"cannot make a writer of '/y' ({_STRING}): the table of static discovery has only these "
-        f"writers for this participant: {listed}; declare the endpoint, and check or plan again"
-    )
-
-
 def connected(*urls: str, super_client: bool = False) -> ET.Element:
     connections = ParticipantConnections(urls=urls, super_client=super_client)
     return made(ParticipantSettings(connections=connections), domain_id=3)
@@ -299,21 +255,6 @@ def test_over_tcp_data_arrive_at_the_port_inside_a_connection_that_discovery_has
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
-@pytest.mark.parametrize(
-    ("machines", "own", "environment", "expected"),
-    [
-        (["", ""], {""}, {}, True),
-        (["a", "b"], {"", "a", "b"}, {"ROS_STATIC_PEERS": ""}, True),
-        (["a", "b"], {"a"}, {}, False),
-        ([""], {""}, {"ROS_STATIC_PEERS": "10.0.2.1"}, False),
-    ],
-)
-def test_endpoints_go_by_multicast_only_where_no_other_host_is_looked_for(
-    machines: list[str], own: set[str], environment: dict[str, str], *, expected: bool
-) -> None:
-    assert all_by_multicast(machines, own, environment) is expected
-
-
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
     environment = discovery_environment(tmp_path)
     assert environment == {VARIABLE: str(tmp_path / "quick_discovery.xml")}
@@ -354,10 +295,8 @@ def test_only_sockets_that_receive_discovery_of_the_domain_get_more_room() -> No
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
             bound.bind(("127.0.0.1", port))
             before = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-            counted = widen_discovery_buffers(231)
-            after = bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-            assert counted == (after > before)
-            return before, after
+            widen_discovery_buffers(231)
+            return before, bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     before, after = room(ports.discovery_unicast)
     assert after > before
