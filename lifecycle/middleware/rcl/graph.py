@@ -47,6 +47,7 @@ from lifecycle.middleware.rcl.graph_queries import (
     endpoints_in,
     endpoints_of,
     endpoints_of_node,
+    nameless_repliers,
     prefix_of,
     rmw_topics,
     services_of_node,
@@ -189,7 +190,7 @@ class GraphObserver:
         else:
             self._topics_before = frozenset(topics)
         homes: dict[str, Counter[str]] = {}
-        for each in self._living(endpoints_in(self.node, topics)):
+        for each in self._living(self._endpoints(topics, names)):
             if each.node:
                 has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
@@ -234,6 +235,18 @@ class GraphObserver:
             folded = fold_actions(self._hashed(judged))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
+
+    def _endpoints(self, topics: Iterable[str], names: DeclaredNames) -> Iterator[ObservedEndpoint]:
+        """Yield the endpoints of topics; of services a nameless participant's ends once."""
+        nameless: set[tuple[EndpointKind, str, str]] = set()
+        replying = nameless_repliers(self.node, topics, names.has)
+        for each in itertools.chain(endpoints_in(self.node, topics), replying):
+            if each.kind in OF_SERVICES and not each.node:
+                end = (each.kind, each.name, each.gid[:PREFIX_DIGITS])
+                if end in nameless:
+                    continue
+                nameless.add(end)
+            yield each
 
     def _living(self, endpoints: Iterable[ObservedEndpoint]) -> list[ObservedEndpoint]:
         """Return the endpoints whose processes have not ended; note the topics' ends of others."""

@@ -142,6 +142,24 @@ def endpoints_in(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint
             yield from _read(node, kind, shown, topic)
 
 
+def nameless_repliers(
+    node: Node, topics: Iterable[str], wanted: Callable[[EndpointKind, str], bool]
+) -> Iterator[ObservedEndpoint]:
+    """Yield the endpoints at reply topics of wanted services that belong to no node, or none yet.
+
+    Whoever writes replies may answer requests that it does not even read.
+    """
+    for topic in topics:
+        if not (OVER_DDS and topic.startswith("rr/") and topic.endswith("Reply")):
+            continue
+        name = topic.removeprefix("rr").removesuffix("Reply")
+        for kind in OF_SERVICES:
+            if wanted(kind, name):
+                writes = kind is EndpointKind.SERVICE_SERVER
+                found = _read(node, kind, name, topic, writes=writes)
+                yield from (each for each in found if not each.node)
+
+
 def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str], str]:
     """Return the topics that the RMW has, and one name that is no UTF-8, escaped; else empty.
 
