@@ -18,7 +18,7 @@ from rclpy.task import Future
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.middleware.rcl.conversions import import_interface
-from lifecycle.middleware.rcl.graph_queries import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import watch_server
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoint import (
@@ -457,7 +457,7 @@ class DataLayer:
                 self._node, entity, self._turns.group, lambda: self._matched(endpoint)
             )
         elif endpoint.kind in CLIENTS:  # their peers are not counted
-            unwatch = ServerWatch(connection.node or self._node, entity, self._changed).stop
+            unwatch = watch_server(connection.node or self._node, entity, self._changed)
         return Placement(connection=connection, entity=entity, unwatch=unwatch)
 
     def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:

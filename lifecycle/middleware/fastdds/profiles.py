@@ -50,10 +50,6 @@ _FILE_NAME = "quick_discovery.xml"
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
 
-FORGOTTEN_S = 21.0
-"""A participant that left without a word is in the graph no more, whoever made its profile: Fast
-DDS's own lease is 20 s."""
-
 PARTICIPANT_LEASE_S = 10
 """The lease in what `up` starts: as long as a machine may be too busy for it to announce itself."""
 

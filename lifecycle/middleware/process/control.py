@@ -57,7 +57,7 @@ def limit_resources(limits: Iterable[tuple[str, int]]) -> None:
 
 
 def check_threads(count: int) -> None:
-    """Make sure that so many threads can be started now; else MiddlewareError names the limits."""
+    """Make sure that so many threads can be started now; else MiddlewareError."""
     over = threading.Event()
     threads: list[threading.Thread] = []
     try:
@@ -118,33 +118,13 @@ def check_memory() -> None:
 
 
 def no_room_for_threads(count: int) -> MiddlewareError:
-    """Return the error of a process that can have no more threads; names the limits that hold."""
+    """Return the error of a process that can have no more threads."""
     threads = "the thread" if count == 1 else f"the {count} threads"
     return MiddlewareError(
-        f"cannot start {threads} that this needs: a limit of processes, threads or memory is "
-        f"reached{_limits()}",
+        f"cannot start {threads} that this needs: a limit of processes, threads or memory is"
+        " reached",
         hint="raise it (ulimit -u, TasksMax= or pids.max; ulimit -v), or end other processes",
     )
-
-
-def _limits() -> str:
-    """Name the limits that are known, getrlimit(2) and cgroups(7)."""
-    found = []
-    soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
-    if soft != resource.RLIM_INFINITY:
-        found.append(f"{soft} for this user")
-    # Each thread has a stack; what it may have of memory ends it as well.
-    for kind, name in ((resource.RLIMIT_AS, "ulimit -v"), (resource.RLIMIT_DATA, "ulimit -d")):
-        soft, _ = resource.getrlimit(kind)
-        if soft != resource.RLIM_INFINITY:
-            found.append(f"{name} allows {soft // 1024} KiB of memory")
-    with contextlib.suppress(OSError, StopIteration):
-        groups = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-        own = next(each for each in groups if each.startswith("0::"))[3:]
-        text = Path(f"/sys/fs/cgroup{own}/pids.max").read_text(encoding="ascii").strip()
-        if text != "max":
-            found.append(f"{text} for this control group")
-    return f" ({', '.join(found)})" if found else ""
 
 
 def machine_id() -> str:

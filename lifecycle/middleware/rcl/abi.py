@@ -255,26 +255,19 @@ class GuardWait:
             raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
 
 
+@functools.lru_cache(maxsize=1)
 def load() -> Rcl:
-    """Load and check the libraries once; raises MiddlewareError where they are not as known."""
-    loaded = _loaded()
-    if isinstance(loaded, MiddlewareError):
-        raise MiddlewareError(loaded.message, hint=loaded.hint)
-    return loaded
+    """Load and check the libraries; raises MiddlewareError where they are not as known."""
+    return Rcl()
 
 
 def refusal() -> str:
     """Return why the installed libraries are not used: version, layout; empty if they are."""
-    loaded = _loaded()
-    return loaded.message if isinstance(loaded, MiddlewareError) else ""
-
-
-@functools.lru_cache(maxsize=1)
-def _loaded() -> Rcl | MiddlewareError:
     try:
-        return Rcl()
+        load()
     except MiddlewareError as error:
-        return error
+        return error.message
+    return ""
 
 
 def assert_liveliness(publisher: int) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import threading
 import time
@@ -29,7 +30,6 @@ from lifecycle.middleware.fastdds.participant import quiet_node
 from lifecycle.middleware.fastdds.prober import Settling
 from lifecycle.middleware.fastdds.profiles import (
     DISCOVERY_SERVER_VARIABLE,
-    FORGOTTEN_S,
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.sockets import give_up_dead_connections
@@ -122,8 +122,7 @@ class GraphObserver:
         self._lock = threading.Lock()
         self._destroyed = False
         self._ours: frozenset[str] = frozenset()
-        self._asked_for: set[str] = set()
-        self._nameless_since_s: dict[str, float] = {}
+        self._asked_at_s: dict[str, float] = {}  # by prefix of a participant without a node
         self._clock: Subscription[Any] | None = None
         self._time_came = False
         self._context: rclpy.Context | None = None
@@ -143,7 +142,6 @@ class GraphObserver:
         self.departed: tuple[ObservedEndpoint, ...] = ()
         self._departed_s: dict[ObservedEndpoint, float] = {}  # when each was last shown
         self._dead: frozenset[str] = frozenset()
-        self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
         self._topics_before: frozenset[str] = frozenset()
 
     @classmethod
@@ -311,12 +309,7 @@ class GraphObserver:
             return
         homes, own = self._homes(), self.prefix
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        theirs = (each for each in claimed if is_of_process(each, pid, own))
-        now_s = time.monotonic()
-        lately = {each: at for each, at in self._ended_until_s.items() if at > now_s}
-        self._ended_until_s = {**lately, pid: now_s + FORGOTTEN_S}
-        self._count_no_more(theirs)
-        self._guard.notify()  # what it had made may be without a name yet
+        self._count_no_more(each for each in claimed if is_of_process(each, pid, own))
 
     def ended_participant(self, prefix: str) -> None:
         """Count participants of an ended process no more, by the GUID prefix of one of them."""
@@ -329,16 +322,7 @@ class GraphObserver:
             self._guard.notify()
 
     def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
-        if endpoint.gid[:PROCESS_DIGITS] in self._dead:
-            return True
-        if endpoint.node or not self._ended_until_s:
-            return False
-        # A process that was killed before the name of its node was known has reported nothing.
-        now_s, prefix = time.monotonic(), endpoint.gid[:PREFIX_DIGITS]
-        return any(
-            now_s < until_s and is_of_process(prefix, pid, self.prefix)
-            for pid, until_s in self._ended_until_s.items()
-        )
+        return endpoint.gid[:PROCESS_DIGITS] in self._dead
 
     def _homes(self) -> dict[str, set[str]]:
         """Return by full name the prefixes of the participants that nodes are on."""
@@ -421,16 +405,12 @@ class GraphObserver:
 
         Others are asked, and the next look has it.
         """
-        known = self.settling.prober.answers()
+        known, now_s = self.settling.prober.answers(), time.monotonic()
         for endpoint in endpoints:
             prefix = endpoint.gid[:PREFIX_DIGITS]
-            if not prefix:
-                yield endpoint
-                continue
-            since_s = self._nameless_since_s.setdefault(prefix, time.monotonic())
-            is_coming = time.monotonic() - since_s < _NAMED_S
-            if prefix not in known and prefix not in self._asked_for and not is_coming:
-                self._asked_for.add(prefix)
+            asked_at_s = self._asked_at_s.setdefault(prefix, now_s + _NAMED_S)
+            if prefix and prefix not in known and now_s >= asked_at_s:
+                self._asked_at_s[prefix] = math.inf
                 self.settling.prober.ask()
             yield replace(endpoint, address=known.get(prefix, ""))
 

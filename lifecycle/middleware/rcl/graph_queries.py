@@ -285,7 +285,9 @@ class GraphGuard:
         self._lock = threading.Lock()
         self._callbacks: dict[object, tuple[Node, Callback]] = {}
         self._node: Node | None = None  # through which it watches
-        self._end: Callable[[], None] = lambda: None
+        self._wake: GuardCondition | None = None
+        self._stopped = threading.Event()
+        self._thread = threading.Thread()
 
     @classmethod
     def of(cls, node: Node) -> GraphGuard:
@@ -298,7 +300,7 @@ class GraphGuard:
         return guard
 
     def follow(self, node: Node, callback: Callback) -> Callable[[], None]:
-        """Have `callback` called in the thread after each change.
+        """Have `callback` called in the thread soon, and after each change.
 
         Args:
             node: of the participant; take the callback away before it is destroyed.
@@ -313,50 +315,49 @@ class GraphGuard:
         """
         key = object()
         with self._lock:
-            if self._node is None:
-                self._start(node)
+            self._watch(self._node or node)
             self._callbacks = {**self._callbacks, key: (node, callback)}
+            if self._wake is not None:
+                self._wake.trigger()
         return lambda: self._remove(key)
 
     def close(self) -> None:
         """Let go of the participant: its context is shut down, or the program ends."""
         with self._lock:
             self._callbacks = {}
-            self._stop()
+            self._watch(None)
 
     def _remove(self, key: object) -> None:
         with self._lock:
             self._callbacks = {other: it for other, it in self._callbacks.items() if other != key}
             nodes = [node for node, _ in self._callbacks.values()]
-            if self._node in (None, *nodes):
-                return
-            self._stop()
-            if nodes:
-                self._start(nodes[0])
-                self.notify()  # changes in between were not reported
+            if self._node not in nodes:
+                self._watch(nodes[0] if nodes else None)
 
-    def _start(self, node: Node) -> None:
-        stopped, wake = threading.Event(), None
-        watch = functools.partial(self._look_often, stopped)
-        if not abi.refusal():
-            wake = GuardCondition(None, None, context=node.context)
-            guards = abi.GuardWait(node.context.handle.pointer, 2)
-            watch = functools.partial(self._wait, node, guards, wake, stopped)
-        thread = threading.Thread(target=watch, name="graph-guard", daemon=True)
-        thread.start()
-
-        def end() -> None:
-            stopped.set()
-            if wake is not None:
-                wake.trigger()
-            thread.join()
-
-        self._node, self._end, self.failure = node, end, None
-
-    def _stop(self) -> None:
+    def _watch(self, node: Node | None) -> None:
+        """Watch through another node, or none."""
+        if node is self._node:
+            return
         if self._node is not None:
             self._node = None
-            self._end()
+            self._stopped.set()
+            if self._wake is not None:
+                self._wake.trigger()
+            self._thread.join()
+            if self._wake is not None:
+                self._wake.destroy()
+        if node is None:
+            return
+        self.failure, self._stopped, self._wake = None, threading.Event(), None
+        watch = functools.partial(self._look_often, self._stopped)
+        if not abi.refusal():
+            self._wake = GuardCondition(None, None, context=node.context)
+            guards = abi.GuardWait(node.context.handle.pointer, 2)
+            watch = functools.partial(self._wait, node, guards, self._wake, self._stopped)
+            self._wake.trigger()  # changes in between are reported by nobody else
+        self._thread = threading.Thread(target=watch, name="graph-guard", daemon=True)
+        self._thread.start()
+        self._node = node
 
     def _look_often(self, stopped: threading.Event) -> None:
         while not stopped.wait(_UNKNOWN_S):
@@ -387,7 +388,6 @@ class GraphGuard:
             self.notify()
         finally:
             guards.close()
-            wake.destroy()
 
     def notify(self) -> bool:
         """Call all back, in this thread; return whether any is to be called again."""
@@ -423,50 +423,38 @@ def is_server_matched(client: AnyClient) -> bool | None:
     return _is_ready(client) if get_rmw_implementation_identifier() in _COUNTING_BOTH_WAYS else None
 
 
-@typing.final
-class ServerWatch:
-    """Calls back when the server of a client was matched, or is no longer.
+def watch_server(
+    node: Node, client: AnyClient, changed: Callable[[], object]
+) -> Callable[[], None]:
+    """Have `changed` called in a thread of the graph when a server of a client's is matched or not.
 
     No event reports that, but each match follows a change of the graph.
 
     Args:
         node: of the client.
-        client: to watch; `stop` before it is destroyed.
-        changed: called in a thread of the graph, also by the constructor if a server is matched
-            already; quick.
+        client: to watch until the returned function is called; then it may be destroyed.
+        changed: quick; also called if a server is matched already.
     """
+    matched = False
 
-    def __init__(self, node: Node, client: AnyClient, changed: Callable[[], None]) -> None:
-        self._node = node
-        self._client = client
-        self._changed = changed
-        self._lock = threading.Lock()
-        self._matched = False
-        self._stop: Callable[[], None] | None = GraphGuard.of(node).follow(node, self._look)
-        self._look()
-
-    def stop(self) -> None:
-        """End it; again is harmless."""
-        if self._stop is not None:
-            self._stop()
-            self._stop = None
-
-    def _look(self) -> bool:
+    def look() -> bool:
         """Look; return whether a match may follow what is in the graph already."""
+        nonlocal matched
+        before = matched
         try:
-            with self._lock:
-                matched = _is_ready(self._client)
-                has_changed = matched != self._matched
-                self._matched = matched
-            if has_changed:
-                self._changed()
-            if isinstance(self._client, Client):
-                service = self._client.service_name
+            matched = _is_ready(client)
+            if isinstance(client, Client):
+                service = client.service_name
             else:
-                service = f"{self._client.action_name}/_action/send_goal"
-            return not matched and bool(self._node.count_services(service))
+                service = f"{client.action_name}/_action/send_goal"
+            is_there = bool(node.count_services(service))
         except (InvalidHandle, *_REFUSED):
             return False  # it was destroyed meanwhile
+        if matched != before:
+            changed()
+        return is_there and not matched
+
+    return GraphGuard.of(node).follow(node, look)
 
 
 def _is_ready(client: AnyClient) -> bool:

@@ -23,7 +23,7 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.rcl.graph_queries import ServerWatch
+from lifecycle.middleware.rcl.graph_queries import watch_server
 from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
@@ -126,7 +126,7 @@ class ForeignNode(NodeInHost):
         if kind.is_topic:
             unwatch = self._watch_matches(kind, entity)
         elif kind in CLIENTS:
-            unwatch = ServerWatch(self.node, entity, self.configuration_changes.touch).stop
+            unwatch = watch_server(self.node, entity, self.configuration_changes.touch)
         placement = Placement(
             connection=connection or self.connections.own, entity=entity, unwatch=unwatch
         )

@@ -353,10 +353,24 @@ def _unattributed(view: View) -> Iterator[Finding]:
         )
 
 
+_VENDORS = {
+    "0101": "RTI Connext DDS",
+    "0103": "OpenDDS",
+    "0109": "RTI Connext Micro",
+    "010f": "Fast DDS",
+    "0110": "Cyclone DDS",
+    "0111": "GurumDDS",
+    "0112": "RustDDS",
+}
+"""By the vendor id that a GUID prefix begins with (DDSI-RTPS §9.3.1.5, dds-foundation.org)."""
+
+
 def _described(endpoint: ObservedEndpoint | None) -> str:
-    """Describe an endpoint's participant as far as it is known: address, GID; else empty."""
+    """Describe an endpoint's participant as far as known: vendor, address, GID; else empty."""
     if endpoint is None:
         return ""
-    known = [f"at {endpoint.address}"] if endpoint.address else []
+    vendor = _VENDORS.get(endpoint.gid[:4], "")
+    known = [f"a participant of {vendor}"] if vendor else []
+    known += [f"at {endpoint.address}"] if endpoint.address else []
     known += [f"GID {endpoint.gid}"] if endpoint.gid else []
     return f" ({', '.join(known)})" if known else ""

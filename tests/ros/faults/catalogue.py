@@ -67,7 +67,7 @@ STATIC = (
         },
         exit_code=ExitCode.MANIFEST_INVALID,
         subject="/chatter",
-        message="no RMW does that for a publisher",
+        message="its participant is made by its own code",
     ),
 )
 
@@ -128,7 +128,7 @@ START = (
         edits={**_command("talker"), f"{TALKER}/run": {"command": ["/no/such/program"]}},
         exit_code=ExitCode.MANIFEST_INVALID,
         subject="talker",
-        message="/no/such/program",
+        message="cannot find program 'program' in '/no/such'",
     ),
     Fault(
         name="the command exits with status 3",
@@ -593,7 +593,7 @@ OUTSIDERS = (
         exit_code=ExitCode.VIOLATED,
         rule="graph.unattributed-endpoint",
         subject="/chatter",
-        message="(at 127.0.0.1, GID ",
+        message="(a participant of Cyclone DDS, at 127.0.0.1, GID ",
         options=("--strict", "--timeout", "6"),
     ),
     Fault(

@@ -64,9 +64,9 @@ def test_a_node_is_made_by_an_rclpy_with_another_constructor(
 def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An rcl whose layouts nobody wrote down."""
     monkeypatch.setattr(abi, "rcl_version", lambda: "11.0.0")
-    abi._loaded.cache_clear()
+    abi.load.cache_clear()
     yield
-    abi._loaded.cache_clear()
+    abi.load.cache_clear()
 
 
 @pytest.mark.usefixtures("unknown")

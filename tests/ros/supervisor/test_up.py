@@ -691,7 +691,7 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
                 "cannot start the fork server: ",
                 *(
                     f"cannot start {what} that this needs: a limit of processes, threads or memory "
-                    f"is reached ({processes} for this user"
+                    "is reached"
                     for what in ("the thread", "the 24 threads")
                 ),
             )

@@ -441,7 +441,8 @@ def test_a_writer_of_no_node_on_a_declared_topic_is_violated_at_every_stage(stag
     finding = the_finding(edit, stage=stage)
     assert (finding.rule, finding.outcome) == ("graph.unattributed-endpoint", Outcome.VIOLATED)
     assert finding.message == (
-        f"no known node has this publisher of {STATUS} (at 10.0.0.7, GID {CYCLONE})"
+        f"no known node has this publisher of {STATUS} (a participant of Cyclone DDS, at 10.0.0.7,"
+        f" GID {CYCLONE})"
     )
 
 
