@@ -112,7 +112,6 @@ class AlivePublisher:
     def __init__(self, node: Node, topic: str, on_listener: Callable[[], None]) -> None:
         self._node = node
         self._on_listener = on_listener
-        self._has_listeners = threading.Event()
         self._ended = threading.Event()
         self._publisher = _publisher(node, String, topic, _ALIVE, matched=self._matched)
         self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
@@ -128,28 +127,20 @@ class AlivePublisher:
     def destroy(self) -> None:
         """Leave properly, which peers see and do not count as a loss."""
         self._ended.set()
-        self._has_listeners.set()
         self._thread.join()
         Node.destroy_publisher(self._node, self._publisher)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
-        if not info.current_count:
-            self._has_listeners.clear()
-        if info.current_count or self._ended.is_set():
-            self._has_listeners.set()
         if info.current_count_change > 0:
             self._on_listener()
 
     def _assert(self) -> None:
-        while self._has_listeners.wait() and not self._ended.is_set():
-            # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen
-            # not to give them back while peers left.
-            try:
+        # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen not
+        # to give them back while peers left.
+        with contextlib.suppress(InvalidHandle):  # its node was destroyed first
+            while not self._ended.wait(_ASSERTED_EACH_S):
                 with self._publisher.handle:
                     abi.assert_liveliness(self._publisher.handle.pointer)
-            except InvalidHandle:
-                return  # its node was destroyed first
-            self._ended.wait(_ASSERTED_EACH_S)
 
 
 @typing.final
