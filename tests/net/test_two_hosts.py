@@ -146,9 +146,7 @@ def test_a_step_waits_for_what_a_driver_shows_on_another_host(
     }
     edit = {
         "nodes/driver": {"run": run, "machine": "a", "managed": False, "endpoints": "open"},
-        "nodes/n2/after": {
-            "driver": {"publishes": "scan", "serves": "~/reset", "parameter": {"ready": False}}
-        },
+        "nodes/n2/after": {"driver": {"publishes": "scan", "serves": "~/reset"}},
     }
     manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
     with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):

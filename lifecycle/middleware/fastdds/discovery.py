@@ -29,6 +29,7 @@ from lifecycle.middleware.fastdds.sockets import (
     interface_addresses,
     open_sockets,
     sockets_in,
+    udp_sockets_of_others,
 )
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
@@ -199,6 +200,22 @@ def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> 
     profile = None if urls else _users_profile(environment)
     protocols = () if profile is None else profile.element.iter("discoveryProtocol")
     return any((each.text or "").strip() not in ("", "SIMPLE", "NONE") for each in protocols)
+
+
+def missing_port(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> int | None:
+    """Return the UDP port of the multicast by which participants find each other, if it is missing.
+
+    If another kind of socket has it, no participant of this host finds another, and Fast DDS 2.14
+    says nothing. None if this process has it, or participants look for each other elsewhere, too.
+    """
+    if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
+        return None
+    port = participant_ports(domain_id, 0).discovery_multicast
+    if _static_peers(environment) or any(each.port == port for each in open_sockets()):
+        return None
+    return port if any(each.port == port for each in udp_sockets_of_others()) else None
 
 
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:

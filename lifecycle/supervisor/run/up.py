@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.fastdds.discovery import (
     discovery_peers,
+    missing_port,
     peers_environment,
 )
 from lifecycle.middleware.fastdds.profiles import (
@@ -287,6 +288,16 @@ async def _observer_participant(
             settle_s=plan.discovery.settle_s,
         )
     discovery = observer_participant.discovery
+    # Nodes elsewhere would be found: they answer to ports of ours.
+    port = missing_port(discovery.domain_id, discovery.urls, os.environ) if plan.processes else None
+    if port is not None:
+        observer_participant.destroy()
+        raise MiddlewareError(
+            f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "
+            "which all participants find each other, is taken by something else",
+            hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
+            "`lifecycle ports` says which are safe",
+        )
     if unasked_s := discovery.settling.unasked_s:
         emit(
             Notice(

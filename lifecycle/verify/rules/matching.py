@@ -277,14 +277,17 @@ def _clients(view: View) -> Iterator[Finding]:
         if not found or not report.mapped or report.server_matched:
             continue
         violated = report.server_matched is False
-        whom = listed(sorted({*found}), 2)
+        whom = f"{client.node} → {listed(sorted({*found}), 2)}"
+        why = "the client counts no server as available"
+        says = f"{whom} are not matched"
+        if not violated:
+            why, says = "its client does not report it", f"nothing proves that {whom} are matched"
         yield UNMATCHED_CLIENT.on(
             client,
             outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
-            subject=f"{client.name}: {client.node} → {whom}",
+            subject=f"{client.name}: {whom}",
             ends=(client.node, found[0]),
             expected="matched",
-            observed="the client counts no server as available"
-            if violated
-            else "its client does not report it",
+            observed=why,
+            message=f"{says} on {client.kind.meets_in} {client.name}: {why}",
         )

@@ -88,7 +88,7 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
             verdict = run.until_found("param.value-differs", f"{node}: {name}", since=since)
             (finding,) = verdict["findings"]
             assert (finding["expected"], finding["observed"]) == (
-                str(right["double_value"]),
+                f"double {right['double_value']} as given under `parameters`",
                 "99.0",
             )
             since = len(run.events)
