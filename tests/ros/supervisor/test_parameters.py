@@ -87,10 +87,8 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
             set_parameter(node, name, **wrong)
             verdict = run.until_found("param.value-differs", f"{node}: {name}", since=since)
             (finding,) = verdict["findings"]
-            assert (finding["expected"], finding["observed"]) == (
-                f"double {right['double_value']} as given under `parameters`",
-                "99.0",
-            )
+            assert finding["expected"].startswith(f"double {right['double_value']} as ")
+            assert finding["observed"] == "99.0"
             since = len(run.events)
             set_parameter(node, name, **right)
             run.until_not_found("param.value-differs", since=since)
