@@ -367,8 +367,11 @@ def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
         carrying: list[PlannedNode | PlannedParticipant] = [node, *node.participants]
         for made in carrying if fast_dds else ():
             if ParticipantSettings.of(made):
+                key = "'connections', 'transport' or 'discovery' as declared"
+                if isinstance(made, PlannedParticipant):
+                    key = f"'transport' or 'connections' as declared ({made.reason})"
                 raise MiddlewareError(
-                    f"{node.at.spelled}: cannot make a participant of {node.key!r} with "
-                    f"'connections', 'transport' or 'discovery' as declared: {fast_dds}",
+                    f"{node.at.spelled}: cannot make a participant of {node.key!r} with {key}: "
+                    f"{fast_dds}",
                     hint=INSTALL,
                 )
