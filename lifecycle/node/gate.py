@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import collections
 import inspect
+import sys
 import time
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
@@ -327,10 +328,12 @@ class Kept:
 
     Args:
         depth: how many, > 0; None for all.
+        lifespan_ns: older ones are not worth anything any more; None for ever.
     """
 
-    def __init__(self, depth: int | None) -> None:
-        self._messages: collections.deque[bytes] = collections.deque(maxlen=depth)
+    def __init__(self, depth: int | None, lifespan_ns: int | None = None) -> None:
+        self._messages: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
+        self._lifespan_ns = lifespan_ns or sys.maxsize
 
     @classmethod
     def of(cls, qos: QosProfile | None) -> Kept | None:
@@ -340,18 +343,21 @@ class Kept:
         if qos.history is History.KEEP_ALL:
             return None
         # A profile may leave the depth to the middleware: 1 with Fast DDS 2.14.
-        return cls(qos.depth if qos.history is History.KEEP_LAST and qos.depth else 1)
+        depth = qos.depth if qos.history is History.KEEP_LAST and qos.depth else 1
+        return cls(depth, qos.lifespan_ns)
 
     def add(self, msg: Any) -> None:
         """Keep a message, or serialized bytes, as it is now: its author may change it later."""
         from rclpy.serialization import serialize_message
 
-        self._messages.append(msg if isinstance(msg, bytes) else serialize_message(msg))
+        data = msg if isinstance(msg, bytes) else serialize_message(msg)
+        self._messages.append((time.monotonic_ns(), data))
 
     def send_again(self, publisher: Publisher) -> None:
         """Publish what is kept by another publisher."""
-        for data in self._messages:
-            publisher.publish(data)
+        for sent_ns, data in self._messages:
+            if time.monotonic_ns() - sent_ns <= self._lifespan_ns:
+                publisher.publish(data)
 
     def forget(self) -> None:
         """Nothing was said."""

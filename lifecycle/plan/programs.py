@@ -419,7 +419,7 @@ class _Sources:
     def _named(
         self, dotted: str, depth: int = 0
     ) -> tuple[_Module, ast.ClassDef | ast.FunctionDef] | _Kind:
-        """Return what a full name stands for, through imports; its kind where that is known.
+        """Return what a full name refers to, through imports; its kind where that is known.
 
         Raises:
             _NotThereError: nothing in its module is called so.

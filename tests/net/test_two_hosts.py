@@ -141,12 +141,14 @@ def test_a_step_waits_for_what_a_driver_shows_on_another_host(
     notes = tmp_path / "notes"
     run = {
         "command": [sys.executable, "-m", "tests.ros.supervisor.late_driver", "driver"],
-        "environment": {"NOTES": str(notes), "COMES": "publishes:2 serves:1"},
+        "environment": {"NOTES": str(notes), "COMES": "publishes:2 serves:1", "READY": "1"},
         "working_directory": str(ROOT),
     }
     edit = {
         "nodes/driver": {"run": run, "machine": "a", "managed": False, "endpoints": "open"},
-        "nodes/n2/after": {"driver": {"publishes": "scan", "serves": "~/reset"}},
+        "nodes/n2/after": {
+            "driver": {"publishes": "scan", "serves": "~/reset", "parameter": "ready"}
+        },
     }
     manifest = article(tmp_path, pair[0].ipv4, pair[1].ipv4, edit=edit)
     with up_on_both(*pair, manifest, runtime=tmp_path) as (up_a, up_b):

@@ -165,8 +165,8 @@ def add_transports(
     is_fixed = any(family.option("metatraffic_port") for family in udp)
     if is_fixed or len(tcp) == len(found) or (udp and not multicast):
         # Fast DDS would not do as asked by itself.
-        heard = [*inside, *(at for each in udp for at in _own(each, of_discovery=True))]
-        _list(builtin, _DISCOVERY_UNICAST, heard)
+        received_at = [*inside, *(at for each in udp for at in _own(each, of_discovery=True))]
+        _list(builtin, _DISCOVERY_UNICAST, received_at)
         _list(builtin, _DISCOVERY_GROUPS, groups_of_all)
     if searched:
         # Named peers replace the groups by which Fast DDS otherwise announces.

@@ -355,7 +355,7 @@ DEFINITIONS = (
         exit_code=ExitCode.VIOLATED,
         rule="graph.type-definition-differs",
         subject="/chatter",
-        message="which is installed here",
+        message="which is installed here: it is matched, and the data are not understood",
     ),
     Fault(
         name="a client was built from another definition of its service",

@@ -34,7 +34,7 @@ from lifecycle import LifecycleNode  # noqa: E402
 class Driver(Node):
     def __init__(self, name: str = "driver") -> None:
         super().__init__(name)
-        self.declare_parameter("ready", False)
+        self.declare_parameter("ready", "READY" in os.environ)
         note(name, "constructed")
         threading.Thread(target=self.come, daemon=True).start()
 

@@ -123,7 +123,9 @@ def test_a_killed_process_is_gone_for_everybody_within_its_lease_and_comes_back_
         # The verdict follows the death by a moment.
         run.until_found("graph.missing-node", "/quiet", since=since)
         told = verb("status", "pair", runtime=tmp_path).stdout.splitlines()
-        assert told[0].startswith("pair: active 1/3, verdict violated (/quiet")
+        assert told[0].startswith(
+            "pair: active 1/3, verdict violated (/quiet, /talker (graph.missing-node)"
+        )
         states = [line.split()[3] for line in told if line.startswith("/")]
         assert sorted(states) == ["active", "dead", "dead"]
         # Also who looks on from outside.

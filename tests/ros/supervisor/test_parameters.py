@@ -79,16 +79,19 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
         judged = verb("verify", str(manifest), *ENOUGH, "--strict", runtime=tmp_path)
         assert judged.returncode == ExitCode.OK, judged.stdout
 
-        for node, name, wrong, right in (
-            ("/robot/left", "gain", double(99.0), double(2.5)),
-            ("/talker", "rate", double(99.0), double(10.0)),
+        given, declared = "given under `parameters`", "declared in its interface"
+        for node, name, wrong, right, expected in (
+            ("/robot/left", "gain", double(99.0), double(2.5), f"double 2.5 as {given}"),
+            (
+                *("/talker", "rate", double(99.0), double(10.0)),
+                f"double 10.0 as {declared}, where nothing else is given",
+            ),
         ):
             since = len(run.events)
             set_parameter(node, name, **wrong)
             verdict = run.until_found("param.value-differs", f"{node}: {name}", since=since)
             (finding,) = verdict["findings"]
-            assert finding["expected"].startswith(f"double {right['double_value']} as ")
-            assert finding["observed"] == "99.0"
+            assert (finding["expected"], finding["observed"]) == (expected, "99.0")
             since = len(run.events)
             set_parameter(node, name, **right)
             run.until_not_found("param.value-differs", since=since)

@@ -285,6 +285,7 @@ def test_every_hostile_answer_is_one_clear_error_in_time(name: str, tmp_path: Pa
         text = str(caught.value)
 
     assert expected.format(url=server.url) in text
+    assert (name == "no UTF-8") is ("utf-8" in text.lower())
     assert took_s < _BOUND_S
     # The list of one flow: its line, and nothing else.
     assert len(text.splitlines()) == 2

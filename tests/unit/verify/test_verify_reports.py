@@ -425,6 +425,20 @@ def test_what_may_not_block_is_refused_by_who_is_strict_alone(
     assert came == refuses
 
 
+def test_what_refuses_nothing_is_placed_at_the_first_declaration():
+    first = replace(VIOLATED, outcome=Outcome.UNVERIFIABLE)
+    found = (first, replace(first, at="other.yaml:2:3"))
+    root = ET.fromstring(to_junit(replace(WRITTEN, findings=found, run=None), PLAN))
+    (case,) = (each for each in root.iter("testcase") if each.get("file"))
+    assert (case.get("file"), case.get("line")) == ("my robot:1.yaml", "18")
+
+
+def test_what_was_judged_before_a_run_failed_is_not_skipped():
+    run = RunEnd(reason="failed: /camera (run.process-died)", reached="active", exit_code=6)
+    came = cases(replace(after(unchanged), run=run))
+    assert {name for name, each in came.items() if each != "passed"} == {"run/end"}
+
+
 def test_junit_escapes_what_xml_cannot_hold():
     text = to_junit(after(NOT_DECLARED), PLAN)
     assert r"/spy<&>\x07" in "".join(ET.fromstring(text).itertext())
