@@ -264,7 +264,7 @@ def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
     for page in tmp_path.rglob("*.html"):
         assert loaded.findall(read(page)) == []
     api = read(tmp_path / "docs/api.html")
-    for name in ("LifecycleNode.on_configure", "on_service", "graph.Graph.wait_for"):
+    for name in ("LifecycleNode.on_configure", "on_service", "graph.graph.Graph.verdict"):
         assert f'id="lifecycle.{name}"' in api
 
 
